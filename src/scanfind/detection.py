@@ -1,0 +1,131 @@
+"""What is found: a detection, its isolated points, and how far it is from the design."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.pose import Pose
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A rigid motion the data do not fix, in the model's frame: turning about a line, or sliding along it.
+
+    kind : "slide" or "roll" (a screw is reported as the one it mostly is)
+    axis : unit direction in the model's frame
+    through : a point on the axis, model frame, metres (for a slide: the model's centre)
+    """
+
+    kind: str
+    axis: tuple[float, float, float]
+    through: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Signed distances of the isolated points from the model's surface, metres, + outside."""
+
+    mean_m: float
+    rms_m: float
+    p95_m: float
+    worst_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class IsolatedPoints:
+    """The raw points of one detection with all their attributes.
+
+    xyz : (N, 3) float64, the scan file's frame
+    attributes : name → (N,), every input field
+    scan_id, source_index : (N,) which scan of the scene, which record of its file
+    deviation : (N,) signed distance to the placed model, metres, + outside
+    """
+
+    xyz: Floats
+    attributes: Mapping[str, NDArray[Any]]
+    scan_id: NDArray[np.int32]
+    source_index: NDArray[np.int64]
+    deviation: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """One instance of one model, as found.
+
+    scene_from_model : in the scan file's own frame, metres
+    score : 0 … 1, how much the evidence speaks for it (see `verify`)
+    support : share of the model's surface samples that lie on the scene (the paper's λs = m_s / m)
+    visible_support : the same among those samples a scanner could see: supported / (supported + seen through)
+    penalty : share of samples through which a beam passed (Papazov & Burschka 2010); 0 where no scanner position is known
+    coverage : share of the model's surface the scan shows, 0 … 1
+    rms_m : root mean square distance of supported samples to the scene's surface
+    unobservable : motions the data do not fix
+    """
+
+    id: int
+    model: str
+    scene_from_model: Pose
+    score: float
+    support: float
+    visible_support: float
+    penalty: float
+    coverage: float
+    rms_m: float
+    unobservable: tuple[Motion, ...] = ()
+    isolated: IsolatedPoints | None = None
+    deviation: Deviation | None = None
+
+    def with_points(self, isolated: IsolatedPoints, deviation: Deviation | None) -> Detection:
+        """The same detection with its isolated points."""
+        return replace(self, isolated=isolated, deviation=deviation)
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A hypothesis that came close and was not believed, and why, in words."""
+
+    model: str
+    scene_from_model: Pose
+    score: float
+    support: float
+    visible_support: float
+    penalty: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class SceneScan:
+    """One scan file (or array) of the scene, as read: valid points, dropped records, where its scanners stood."""
+
+    path: str
+    points: int
+    dropped: int
+    stations: tuple[tuple[float, float, float] | None, ...]
+
+
+class Findings(list[Detection]):
+    """The detections, best first, with what a report needs around them."""
+
+    refused: list[Refused]
+    scans: list[SceneScan]
+    shift: tuple[float, float, float]
+    crs: str | None
+    timings_s: dict[str, float]
+    notes: list[str]
+
+    def __init__(self, detections: list[Detection] | None = None) -> None:
+        super().__init__(detections or [])
+        self.refused, self.scans, self.notes = [], [], []
+        self.shift, self.crs, self.timings_s = (0.0, 0.0, 0.0), None, {}
+
+
