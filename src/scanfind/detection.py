@@ -127,5 +127,3 @@ class Findings(list[Detection]):
         super().__init__(detections or [])
         self.refused, self.scans, self.notes = [], [], []
         self.shift, self.crs, self.timings_s = (0.0, 0.0, 0.0), None, {}
-
-

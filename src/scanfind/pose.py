@@ -99,7 +99,9 @@ class Pose:
         """How far apart two poses are: translation in metres, rotation in radians."""
         relative = self.rotation.T @ other.rotation
         # atan2 of |sin| and cos keeps its digits at small angles, where arccos loses half of them.
-        axis = np.array([relative[2, 1] - relative[1, 2], relative[0, 2] - relative[2, 0], relative[1, 0] - relative[0, 1]])
+        axis = np.array(
+            [relative[2, 1] - relative[1, 2], relative[0, 2] - relative[2, 0], relative[1, 0] - relative[0, 1]]
+        )
         angle = np.arctan2(np.linalg.norm(axis), np.trace(relative) - 1.0)
         return float(np.linalg.norm(self.translation - other.translation)), float(angle)
 
