@@ -102,8 +102,22 @@ class OrientedCloud:
         return len(self.points)
 
 
+@dataclass(frozen=True, eq=False)
+class CloudModel:
+    """A piece of scan used as a model ("find more of this").
+
+    points : (N, 3) float64, metres
+    origin : (3,) where its scanner stood, same frame; None where nobody knows (then its normals have no known side)
+    """
+
+    name: str
+    points: Floats
+    source: str = ""
+    origin: Floats | None = None
+
+
 def as_points(array: ArrayLike, what: str = "points") -> Floats:
-    """The door for arrays from outside: (N, 3) float64, C-contiguous. Raises InvalidGeometryError for any other shape."""
+    """The door for arrays from outside: (N, 3) float64, C-contiguous; raises InvalidGeometryError."""
     try:
         points = np.ascontiguousarray(array, dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -66,7 +66,7 @@ class Detection:
     score : 0 … 1, how much the evidence speaks for it (see `verify`)
     support : share of the model's surface samples that lie on the scene (the paper's λs = m_s / m)
     visible_support : the same among those samples a scanner could see: supported / (supported + seen through)
-    penalty : share of samples through which a beam passed (Papazov & Burschka 2010); 0 where no scanner position is known
+    penalty : share of samples through which a beam passed (Papazov & Burschka 2010); 0 without origins
     coverage : share of the model's surface the scan shows, 0 … 1
     rms_m : root mean square distance of supported samples to the scene's surface
     unobservable : motions the data do not fix

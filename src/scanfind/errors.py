@@ -1,4 +1,4 @@
-"""Every error scanfind raises on purpose: what happened, why, what to do; and the exit code the command line gives it."""
+"""Every error scanfind raises on purpose: what, why, what to do, and the exit code it gives."""
 
 from __future__ import annotations
 

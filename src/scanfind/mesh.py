@@ -44,7 +44,7 @@ class Mesh:
 
     @staticmethod
     def of(name: str, vertices: ArrayLike, faces: ArrayLike, source: str = "") -> Mesh:
-        """The door: checks shapes, finiteness and indices; raises InvalidGeometryError. Degenerate faces are removed."""
+        """The door: checks shapes, finiteness and indices; raises InvalidGeometryError. Degenerate faces go."""
         v = np.ascontiguousarray(vertices, dtype=np.float64)
         f = np.ascontiguousarray(faces, dtype=np.int64)
         if v.ndim != 2 or v.shape[1] != 3 or f.ndim != 2 or f.shape[1] != 3:
