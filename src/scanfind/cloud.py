@@ -52,7 +52,7 @@ class PointChunk:
 
 @dataclass(frozen=True)
 class Station:
-    """One scan of a file: its name, its number of records as the header states it, where its scanner stood (or None)."""
+    """One scan of a file: name, number of records its header states, where its scanner stood (or None)."""
 
     name: str
     points: int
