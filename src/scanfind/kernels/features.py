@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import acos, floor, sqrt
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 
 @njit(inline="always")
@@ -23,13 +23,13 @@ def feature_key(f1, f2, f3, angle_cell, angle_bins):
     return (b1 * angle_bins + b2) * angle_bins + b3
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def count_pairs(points, distance, tolerance):
     """How many points j lie at distance ± tolerance from each point i, (N,)."""
     n = points.shape[0]
     near, far = (distance - tolerance) ** 2, (distance + tolerance) ** 2
     counts = np.zeros(n, np.int64)
-    for i in prange(n):
+    for i in range(n):
         found = 0
         for j in range(n):
             dx, dy, dz = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
@@ -40,12 +40,12 @@ def count_pairs(points, distance, tolerance):
     return counts
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def fill_pairs(points, normals, distance, tolerance, angle_cell, angle_bins, starts, keys, first, second):
     """Write the key and the two ends of every pair counted by `count_pairs`, point i from starts[i] on."""
     n = points.shape[0]
     near, far = (distance - tolerance) ** 2, (distance + tolerance) ** 2
-    for i in prange(n):
+    for i in range(n):
         at = starts[i]
         ax, ay, az = normals[i, 0], normals[i, 1], normals[i, 2]
         for j in range(n):
