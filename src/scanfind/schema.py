@@ -1,0 +1,126 @@
+"""What results.json holds, field by field. `Results.model_json_schema()` gives it as a JSON schema.
+
+Everything is in metres, radians and the scan file's own frame. A number that does not exist is null, never NaN.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+SCHEMA = 1
+
+Vector = tuple[float, float, float]
+Row = tuple[float, float, float, float]
+Matrix = tuple[Row, Row, Row, Row]
+
+
+class Entry(BaseModel):
+    """A part of results.json: unchanging; a key it does not know is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class ScanEntry(Entry):
+    """A scan file of the scene. `stations_m`: where its scanners stood, null where nobody knows.
+
+    `fingerprint` tells whether a file is still the one that was searched; null for points that came in memory.
+    """
+
+    path: str
+    points: int
+    dropped: int
+    stations_m: list[Vector | None]
+    fingerprint: str | None = None
+
+
+class ModelEntry(Entry):
+    """A model that was sought. `sha256`: of its geometry and of the parameters it was prepared with."""
+
+    name: str
+    sha256: str
+    diameter_m: float
+    pairs: int
+
+
+class Quaternion(Entry):
+    """A rotation, its parts named because half the world puts w first."""
+
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+class MotionEntry(Entry):
+    """A motion the data do not fix, model frame: `kind` is slide or roll."""
+
+    kind: str
+    axis: Vector
+    through_m: Vector
+
+
+class DeviationEntry(Entry):
+    """Signed distances of the isolated points from the model's surface, + outside."""
+
+    mean_m: float | None
+    rms_m: float | None
+    p95_m: float | None
+    worst_m: float | None
+
+
+class DetectionEntry(Entry):
+    """One instance of one model. `isolated` and `pose` are files of the result folder, null where none was written."""
+
+    id: int
+    model: str
+    scene_from_model: Matrix
+    translation_m: Vector
+    quaternion: Quaternion
+    score: float | None
+    support: float | None
+    visible_support: float | None
+    penalty: float | None
+    coverage: float | None
+    rms_m: float | None
+    unobservable: list[MotionEntry]
+    points: int
+    isolated: str | None
+    pose: str | None
+    deviation: DeviationEntry | None
+
+
+class RefusedEntry(Entry):
+    """A hypothesis that came close, and why it was not believed."""
+
+    model: str
+    scene_from_model: Matrix
+    score: float | None
+    support: float | None
+    visible_support: float | None
+    penalty: float | None
+    reason: str
+
+
+class Results(Entry):
+    """results.json. `shift_m` was taken off while computing; every coordinate here has it added back."""
+
+    schema_: int = Field(SCHEMA, alias="schema")
+    scanfind: str
+    seed: int
+    parameters: dict[str, Any]
+    shift_m: Vector
+    crs: str | None
+    scans: list[ScanEntry]
+    models: list[ModelEntry]
+    detections: list[DetectionEntry]
+    refused: list[RefusedEntry]
+    remainder: str | None = None
+    notes: list[str] = []
+    timings_s: dict[str, float]
+    peak_memory_bytes: int
+
+    def to_json(self) -> str:
+        """The text of results.json, one line's indent two blanks, keys in the order above."""
+        return self.model_dump_json(indent=2, by_alias=True)
