@@ -1,0 +1,70 @@
+"""The command line: one library call a command. Data on stdout, words on stderr, errors in one line.
+
+Exit codes: 0 done, 1 error, 2 wrong call, 3 done but something was not found (only with --fail-on), 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+from cyclopts import App, CycloptsError
+
+from scanfind.cli.find import find
+from scanfind.cli.info import info
+from scanfind.cli.isolate import isolate
+from scanfind.cli.library import library
+from scanfind.errors import Interrupted, ScanfindError, UsageError
+
+HELP = """Find known 3D objects (CAD, BIM or a piece of scan) in cluttered laser scans.
+
+For example:
+
+    scanfind find shop.e57 --model spool.stl --units mm --out found
+"""
+
+
+def _version() -> str:
+    from scanfind import __version__
+
+    return __version__
+
+
+app = App(name="scanfind", help=HELP, version=_version, help_formatter="plain", help_format="plaintext")
+app.command(find)
+app.command(library)
+app.command(isolate)
+app.command(info)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; its exit code. `arguments` are the process's own where None."""
+    # Paths may hold bytes that are no text, and terminals letters they cannot show: neither is worth dying for.
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+    except CycloptsError as error:
+        return _fail(f"{error}: see scanfind --help", UsageError.exit_code)
+    except ScanfindError as error:
+        return _fail(error, error.exit_code)
+    except KeyboardInterrupt:
+        return _fail("interrupted: nothing half done is left behind", Interrupted.exit_code)
+    except MemoryError as error:
+        return _fail(f"out of memory: {error}: give fewer scans or a coarser grid", ScanfindError.exit_code)
+    except Exception as error:  # whatever it is, a user gets one line
+        what = f"{type(error).__name__}: {error}"
+        return _fail(f"internal error: {what}: please report it, with SCANFIND_DEBUG=1 set", ScanfindError.exit_code)
+    return code if isinstance(code, int) else 0
+
+
+def _fail(why: object, code: int) -> int:
+    """Say in one line what went wrong; SCANFIND_DEBUG=1 shows where."""
+    if os.environ.get("SCANFIND_DEBUG"):
+        import traceback
+
+        traceback.print_exc()
+    print("scanfind:", " ".join(str(why).split()), file=sys.stderr)
+    return code

@@ -1,0 +1,149 @@
+"""`scanfind find`: models and scans in, every instance's pose and points out."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from scanfind.cli.options import Flag, Format, Names, Paths, Position, Units, note, say
+from scanfind.errors import UsageError
+
+if TYPE_CHECKING:
+    from scanfind.schema import Results
+
+NOT_FOUND = 3
+
+
+def find(
+    scans: Annotated[list[Path], Parameter(name="SCAN", negative=())],
+    /,
+    *,
+    model: Paths | None = None,
+    library: Path | None = None,
+    select: Names | None = None,
+    units: Units | None = None,
+    origin: Position | None = None,
+    out: Path | None = None,
+    format: Format | None = None,
+    remainder: Flag = False,
+    overwrite: Flag = False,
+    json: Flag = False,
+    preset: str | None = None,
+    config: Path | None = None,
+    seed: int | None = None,
+    jobs: int | None = None,
+    max_instances: int | None = None,
+    min_score: float | None = None,
+    tolerance: float | None = None,
+    time_limit: float | None = None,
+    fail_on: Literal["not-found"] | None = None,
+) -> int:
+    """Find every instance of every model in the scans; the files of several scans are one scene.
+
+    For example:
+
+        scanfind find shop.e57 --model spool.stl --units mm --out found
+
+        scanfind find station1.laz station2.laz --library parts.scanfind --json
+
+    Parameters
+    ----------
+    scans
+        Scan files: E57, LAS, LAZ, PLY, PCD, PTX, PTS, XYZ, CSV. They come before --model.
+    model
+        Model files: STL, OBJ, PLY, GLB, OFF, 3MF, STEP, IFC, or a point cloud cut from a scan.
+    library
+        A model library made with `scanfind library add`, instead of --model.
+    select
+        Of an IFC file only these: class, name or GlobalId.
+    units
+        Of model files whose format does not say; metres unless given.
+    origin
+        X,Y,Z where the scanner stood, metres, for scans that do not say.
+    out
+        A new folder for poses and points; nothing is written without it.
+    format
+        Of the isolated point clouds; ply unless given.
+    remainder
+        Also write what is left of the scene without the found objects (needs --out).
+    overwrite
+        Replace an older result in --out.
+    json
+        Print results.json on stdout instead of a table.
+    preset
+        Settings to start from: default or sharif2017.
+    config
+        A TOML file of settings; flags and SCANFIND_... variables win over it.
+    seed
+        Of the random draws: the same seed gives the same answer; 0 unless given.
+    jobs
+        Threads; one a core unless given.
+    max_instances
+        At most so many instances in all.
+    min_score
+        Refuse what scores less, 0 to 1.
+    tolerance
+        Points this near to a found model are its own, metres.
+    time_limit
+        Search no longer than this, seconds.
+    fail_on
+        Exit with 3 if some model was not found.
+
+    """
+    if (model is None) == (library is None):
+        msg = "find: no model to look for: give --model FILE... after the scans, or --library LIB"
+        raise UsageError(msg if model is None else "find: --model and --library exclude each other: give one of them")
+    if remainder and out is None:
+        msg = "find: --remainder has nowhere to go: give --out DIR"
+        raise UsageError(msg)
+
+    from scanfind.cli.inputs import open_models, open_remainder
+    from scanfind.config import load_settings
+    from scanfind.find import PRESETS
+    from scanfind.find import find as find_models
+    from scanfind.progress import progress_on
+    from scanfind.results import document, fill_folder, result_folder
+
+    flags = {
+        "preset": preset, "seed": seed, "jobs": jobs, "units": units, "origin": origin, "format": format,
+        "select": select, "search.max_instances": max_instances, "search.time_limit_s": time_limit,
+        "verify.min_score": min_score, "isolate.tolerance_m": tolerance,
+    }  # fmt: skip
+    run, parameters = load_settings(PRESETS, flags, config)
+    with ExitStack() as stack:
+        folder = None if out is None else stack.enter_context(result_folder(out, overwrite=overwrite))
+        models = stack.enter_context(open_models(model or [], library, run, parameters))
+        progress = stack.enter_context(progress_on())
+        rest = folder / f"remainder.{run.format}" if folder is not None and remainder else None
+        sink = None if rest is None else stack.enter_context(open_remainder(rest, scans))
+        findings = find_models(
+            scans, models, parameters=parameters, seed=run.seed, jobs=run.jobs, origin=run.origin,
+            progress=progress, remainder=sink,
+        )  # fmt: skip
+        known = {"models": models, "parameters": parameters, "seed": run.seed}
+        if folder is None:
+            results = document(findings, **known)
+        else:
+            left = rest.name if rest else None
+            results = fill_folder(folder, findings, **known, format=run.format, remainder=left, progress=progress)
+    report(results, out, json=json)
+    missing = {entry.name for entry in results.models} - {found.model for found in results.detections}
+    return NOT_FOUND if fail_on == "not-found" and missing else 0
+
+
+def report(results: Results, out: Path | None, *, json: bool) -> None:
+    """The table (or results.json) on stdout; on stderr where it lies and what was not found."""
+    from scanfind.cli.tables import closest, found_table
+
+    if json:
+        say(results.to_json())
+    elif results.detections:
+        say(found_table(results))
+    for remark in [*results.notes, *closest(results)]:
+        note(remark)
+    points = sum(scan.points for scan in results.scans)
+    where = "nothing written, give --out DIR to keep poses and points" if out is None else f"results in {out}"
+    note(f"{len(results.detections)} found in {points:,} points, {results.timings_s['total']:.1f} s; {where}")

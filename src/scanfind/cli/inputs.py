@@ -1,0 +1,55 @@
+"""What the commands read: models into a library, and what fields the scans bring."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from scanfind.config import Run
+    from scanfind.find import Parameters
+    from scanfind.library import ModelLibrary
+    from scanfind.scans import CloudWriter
+
+
+@contextmanager
+def open_models(
+    files: Sequence[Path], library: Path | None, run: Run, parameters: Parameters
+) -> Iterator[ModelLibrary]:
+    """The library at that path, or one in memory made of the model files."""
+    from scanfind.library import ModelLibrary
+
+    with ModelLibrary.in_memory() if library is None else ModelLibrary.open(library) as models:
+        add_models(models, files, run, parameters)
+        yield models
+
+
+def add_models(models: ModelLibrary, files: Sequence[Path], run: Run, parameters: Parameters) -> list[str]:
+    """Prepare every model of the files and keep it in the library; their names."""
+    from scanfind.library import ModelParameters
+    from scanfind.models import read_models
+
+    prepared = ModelParameters(surface=parameters.surface, pairs=parameters.pairs)
+    return [
+        models.add(model, prepared).name
+        for file in files
+        for model in read_models(file, units=run.units, select=run.select)
+    ]
+
+
+def open_remainder(path: Path, scans: Sequence[Path]) -> CloudWriter:
+    """A cloud file that has room for every field of the scans, and for scan_id and source_index."""
+    import numpy as np
+
+    from scanfind.scans import open_writer, scan_info
+
+    fields: dict[str, np.dtype[np.generic]] = {}
+    infos = [scan_info(scan) for scan in scans]
+    for info in infos:
+        for name, kind in info.attributes.items():
+            dtype = np.dtype(kind)
+            fields[name] = np.promote_types(fields[name], dtype) if name in fields else dtype
+    fields |= {"scan_id": np.dtype(np.int32), "source_index": np.dtype(np.int64)}
+    return open_writer(path, fields, crs=next((info.crs for info in infos if info.crs), None))

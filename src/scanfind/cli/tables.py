@@ -1,0 +1,84 @@
+"""Tables for people: metres where things stand, millimetres for how well they fit, degrees for how they are turned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import atan2, degrees, hypot
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from scanfind.schema import DetectionEntry, Matrix, RefusedEntry, Results
+
+FOUND = (
+    "id", "model", "x m", "y m", "z m", "yaw °", "pitch °", "roll °", "score", "visible %", "rms mm", "points",
+    "deviation mm", "free to",
+)  # fmt: skip
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Columns as wide as their widest cell; those that hold numbers on the right."""
+    columns = list(zip(header, *rows, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    right = [bool(rows) and all(_is_number(cell) for cell in column[1:]) for column in columns]
+    lines = (
+        "  ".join(cell.rjust(w) if r else cell.ljust(w) for cell, w, r in zip(line, widths, right, strict=True))
+        for line in (header, *rows)
+    )
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def found_table(results: Results) -> str:
+    """One line a detection."""
+    return table(FOUND, [_found_row(found) for found in results.detections])
+
+
+def closest(results: Results) -> list[str]:
+    """A line for each model that was not found: what came closest, and why it was refused."""
+    found = {detection.model for detection in results.detections}
+    lines = []
+    for model in results.models:
+        if model.name in found:
+            continue
+        near = [refused for refused in results.refused if refused.model == model.name]
+        if near:
+            best = max(near, key=_closeness)
+            x, y, z = (row[3] for row in best.scene_from_model[:3])
+            where = f"the closest was at {x:.3f} {y:.3f} {z:.3f} m, score {_number(best.score, 2)}: {best.reason}"
+        else:
+            where = "no part of the scene looks like it"
+        lines.append(f"{model.name}: not found: {where}")
+    return lines
+
+
+def turned(matrix: Matrix) -> tuple[float, float, float]:
+    """Yaw about z, then pitch about the new y, then roll about the new x, degrees."""
+    (a, _, _, _), (b, _, _, _), (c, d, e, _), _ = matrix
+    return degrees(atan2(b, a)), degrees(atan2(-c, hypot(d, e))), degrees(atan2(d, e))
+
+
+def _found_row(found: DetectionEntry) -> list[str]:
+    deviation = found.deviation
+    return [
+        str(found.id),
+        found.model,
+        *(f"{value:.3f}" for value in found.translation_m),
+        *(f"{value:.2f}" for value in turned(found.scene_from_model)),
+        _number(found.score, 2),
+        _number(found.visible_support, 0, 100.0),
+        _number(found.rms_m, 1, 1e3),
+        f"{found.points:,}",
+        "–" if deviation is None else f"{_number(deviation.mean_m, 1, 1e3)} ± {_number(deviation.rms_m, 1, 1e3)}",
+        ", ".join(motion.kind for motion in found.unobservable) or "–",
+    ]
+
+
+def _closeness(refused: RefusedEntry) -> float:
+    return -1.0 if refused.score is None else refused.score
+
+
+def _number(value: float | None, decimals: int, factor: float = 1.0) -> str:
+    return "–" if value is None else f"{value * factor:.{decimals}f}"
+
+
+def _is_number(cell: str) -> bool:
+    return cell == "–" or cell.replace(",", "").replace(".", "").lstrip("-").isdigit()

@@ -1,0 +1,376 @@
+"""The result folder: results.json, results.csv, a pose per instance, its points. Whole or not there at all."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import os
+import re
+import shutil
+import sys
+import time
+import unicodedata
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from scanfind import schema
+from scanfind.errors import OutputError, UnreadableFileError
+
+if TYPE_CHECKING:
+    from scanfind.detection import Detection, Findings, IsolatedPoints, Refused
+    from scanfind.library import ModelLibrary
+    from scanfind.pose import Pose
+    from scanfind.progress import Progress
+
+RESULTS_JSON = "results.json"
+RESULTS_CSV = "results.csv"
+MODELS = "models.scanfind"
+
+# Both ends of a file and its length: a GB is told apart from another in milliseconds, not in seconds.
+FINGERPRINT_BLOCK = 1 << 20
+NAME_BYTES = 120  # of a model's name in a file name; file systems stop at 255
+
+
+@contextmanager
+def result_folder(out: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
+    """A folder to fill beside `out`, which takes the name `out` when the block ends well and goes when it does not.
+
+        overwrite : replace an older scanfind result; never anything else
+
+    Raises OutputError where `out` is a file, holds what scanfind did not write, or cannot be written.
+    """
+    target = Path(out).absolute()
+    check_free(target, overwrite=overwrite)
+    staged = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        staged.mkdir()
+        yield staged
+        check_free(target, overwrite=overwrite)  # searching takes long enough for somebody else to have come
+        _swap(staged, target)
+    except OSError as error:
+        msg = f"{out}: results cannot be written: {error.strerror or error}: choose another folder or make room"
+        raise OutputError(msg) from error
+    finally:
+        shutil.rmtree(staged, ignore_errors=True)
+
+
+def check_free(target: Path, *, overwrite: bool) -> None:
+    """Raise OutputError unless a result folder may take this place."""
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+        return
+    if not target.is_dir():
+        msg = f"{target}: is a file: results need a folder, choose another"
+        raise OutputError(msg)
+    if not (target / RESULTS_JSON).is_file():
+        msg = f"{target}: holds files that are not scanfind's: choose another folder"
+        raise OutputError(msg)
+    if not overwrite:
+        msg = f"{target}: holds an earlier result: choose another folder or pass --overwrite"
+        raise OutputError(msg)
+    foreign = sorted(_files_under(target) - _files_of(read_results(target)))
+    if foreign:
+        msg = f"{target}: holds {foreign[0]}, which scanfind did not write: move it away or choose another folder"
+        raise OutputError(msg)
+
+
+def write_results(
+    findings: Findings,
+    out: str | Path,
+    *,
+    models: ModelLibrary,
+    parameters: object,
+    seed: int = 0,
+    format: str = "ply",
+    overwrite: bool = False,
+) -> schema.Results:
+    """Write everything found into a new folder `out`; returns what its results.json holds.
+
+    Arguments and errors as for `fill_folder` and `result_folder`.
+    """
+    with result_folder(out, overwrite=overwrite) as folder:
+        return fill_folder(folder, findings, models=models, parameters=parameters, seed=seed, format=format)
+
+
+def fill_folder(
+    folder: Path,
+    findings: Findings,
+    *,
+    models: ModelLibrary,
+    parameters: object,
+    seed: int = 0,
+    format: str = "ply",
+    remainder: str | None = None,
+    progress: Progress | None = None,
+) -> schema.Results:
+    """Fill a staged result folder with everything found; returns what its results.json holds.
+
+    folder : exists and is empty but for `remainder`, see `result_folder`
+    models : the library that was searched
+    parameters : of the search, a nested dataclass
+    format : of the isolated clouds: ply, laz, las, e57 or pcd
+    remainder : the file in `folder` that holds the rest of the scene, where one was written
+
+    Raises UnsupportedFormatError for another format, OutputError where the disk says no.
+    """
+    began = time.perf_counter()
+    files: dict[int, tuple[str, str | None]] = {}
+    total, written = sum(len(found.isolated or ()) for found in findings), 0
+    for found in findings:
+        stem = f"{found.id:03d}_{safe_name(found.model)}"
+        pose = f"poses/{stem}.txt"
+        points = f"points/{stem}.{format}" if found.isolated is not None else None
+        files[found.id] = pose, points
+        _write_pose(folder / pose, found.scene_from_model)
+        if found.isolated is not None:
+            _write_points(folder / f"points/{stem}.{format}", found.id, found.isolated, findings)
+            written += len(found.isolated)
+            if progress is not None:
+                progress("write", written, total)
+    if findings:
+        _write_models(folder / MODELS, models, {found.model for found in findings})
+    results = document(findings, models=models, parameters=parameters, seed=seed, files=files, remainder=remainder)
+    _write_csv(folder / RESULTS_CSV, results)
+    took = time.perf_counter() - began
+    timings = results.timings_s | {"write": took, "total": results.timings_s["total"] + took}
+    results = results.model_copy(update={"timings_s": timings})
+    (folder / RESULTS_JSON).write_text(results.to_json() + "\n", encoding="utf-8")
+    return results
+
+
+def document(
+    findings: Findings,
+    *,
+    models: ModelLibrary,
+    parameters: object,
+    seed: int,
+    files: dict[int, tuple[str, str | None]] | None = None,
+    remainder: str | None = None,
+) -> schema.Results:
+    """The findings as results.json has them.
+
+    files : detection's id → its pose file and point file in the result folder, where there is one
+    """
+    from scanfind import __version__
+
+    files = files or {}
+    stages = ("read", "grid", "search", "verify", "refine", "isolate", "write")
+    timings = dict.fromkeys(stages, 0.0) | findings.timings_s
+    timings["total"] = findings.timings_s.get("total", sum(findings.timings_s.values()))
+    return schema.Results(
+        schema=schema.SCHEMA,
+        scanfind=__version__,
+        seed=seed,
+        parameters=asdict(parameters) if is_dataclass(parameters) and not isinstance(parameters, type) else {},
+        shift_m=findings.shift,
+        crs=findings.crs,
+        scans=[
+            schema.ScanEntry(
+                path=_text(scan.path),
+                points=scan.points,
+                dropped=scan.dropped,
+                stations_m=list(scan.stations),
+                fingerprint=fingerprint(Path(scan.path)),
+            )
+            for scan in findings.scans
+        ],
+        models=_model_entries(models),
+        detections=[_detection_entry(found, *files.get(found.id, (None, None))) for found in findings],
+        refused=[_refused_entry(refused) for refused in findings.refused],
+        remainder=remainder,
+        notes=list(findings.notes),
+        timings_s=timings,
+        peak_memory_bytes=peak_memory_bytes(),
+    )
+
+
+def read_results(folder: str | Path) -> schema.Results:
+    """results.json of a result folder (or the file itself).
+
+    Raises UnreadableFileError where it is missing, damaged, or of a version this scanfind does not know.
+    """
+    path = Path(folder)
+    path = path / RESULTS_JSON if path.is_dir() else path
+    try:
+        return schema.Results.model_validate_json(path.read_bytes())
+    except OSError as error:
+        msg = f"{path}: no result to read: {error.strerror}: name the folder that `scanfind find --out` wrote"
+        raise UnreadableFileError(msg) from error
+    except ValueError as error:  # pydantic's ValidationError is one
+        first = str(error).splitlines()
+        msg = f"{path}: not a results.json of this version of scanfind: {' '.join(first[1:3])}: search again"
+        raise UnreadableFileError(msg) from error
+
+
+def fingerprint(path: Path) -> str | None:
+    """sha256 of a file's length and of its first and last MiB; None where there is no such file.
+
+    It tells an exchanged or edited scan from the one searched, not an adversary's: hashing all of 100 GB takes minutes.
+    """
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            digest = hashlib.sha256(str(size).encode())
+            digest.update(file.read(FINGERPRINT_BLOCK))
+            file.seek(max(size - FINGERPRINT_BLOCK, 0))
+            digest.update(file.read(FINGERPRINT_BLOCK))
+    except (OSError, ValueError):
+        return None
+    return f"sha256-ends:{digest.hexdigest()}"
+
+
+def safe_name(name: str) -> str:
+    """A model's name as part of a file name on any system: letters and digits of any script, `-`, `_`, inner dots."""
+    plain = re.sub(r"[^\w.-]+", "_", unicodedata.normalize("NFC", name)).strip("._")
+    return plain.encode()[:NAME_BYTES].decode(errors="ignore") or "model"
+
+
+def peak_memory_bytes() -> int:
+    """The most memory this process has held, bytes; 0 where the system does not tell."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def _model_entries(models: ModelLibrary) -> list[schema.ModelEntry]:
+    return [
+        schema.ModelEntry(name=model.name, sha256=model.sha256, diameter_m=model.diameter, pairs=model.pairs)
+        for model in models.show()
+    ]
+
+
+def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -> schema.DetectionEntry:
+    deviation = found.deviation
+    return schema.DetectionEntry(
+        id=found.id,
+        model=found.model,
+        scene_from_model=_rows(found.scene_from_model),
+        translation_m=_vector(found.scene_from_model.translation),
+        quaternion=schema.Quaternion(**found.scene_from_model.quaternion()),
+        score=found.score,
+        support=found.support,
+        visible_support=found.visible_support,
+        penalty=found.penalty,
+        coverage=found.coverage,
+        rms_m=found.rms_m,
+        unobservable=[schema.MotionEntry(kind=m.kind, axis=m.axis, through_m=m.through) for m in found.unobservable],
+        points=0 if found.isolated is None else len(found.isolated),
+        isolated=isolated,
+        pose=pose,
+        deviation=None if deviation is None else schema.DeviationEntry(**asdict(deviation)),
+    )
+
+
+def _refused_entry(refused: Refused) -> schema.RefusedEntry:
+    return schema.RefusedEntry(
+        model=refused.model,
+        scene_from_model=_rows(refused.scene_from_model),
+        score=refused.score,
+        support=refused.support,
+        visible_support=refused.visible_support,
+        penalty=refused.penalty,
+        reason=refused.reason,
+    )
+
+
+def _rows(pose: Pose) -> schema.Matrix:
+    a, b, c, d = (tuple(row) for row in pose.matrix().tolist())
+    return a, b, c, d
+
+
+def _vector(values: Iterable[float]) -> schema.Vector:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _text(path: str) -> str:
+    """A path as JSON can hold it: Linux allows names that are no text at all."""
+    return os.fsencode(path).decode(errors="replace")
+
+
+def _write_models(path: Path, models: ModelLibrary, names: set[str]) -> None:
+    """The models found, so that their points can be cut again without the library that was searched."""
+    from scanfind.library import ModelLibrary
+
+    with ModelLibrary.open(path, create=True) as kept:
+        for name in sorted(names):
+            kept.put(models.get(name))
+
+
+def _write_pose(path: Path, pose: Pose) -> None:
+    """Four rows of four numbers, scene_from_model, as CloudCompare's Edit > Apply transformation takes them."""
+    path.parent.mkdir(exist_ok=True)
+    rows = (" ".join(repr(value) for value in row) for row in pose.matrix().tolist())
+    path.write_text("\n".join(rows) + "\n", encoding="ascii")
+
+
+def _write_points(path: Path, instance: int, points: IsolatedPoints, findings: Findings) -> None:
+    """The isolated points with every field of the scan, and instance, scan_id, source_index, deviation."""
+    import numpy as np
+
+    from scanfind.scans import open_writer
+
+    path.parent.mkdir(exist_ok=True)
+    # Ours win over fields of the same name: a scan that was a result before has them too, and they are stale.
+    columns = dict(points.attributes) | {
+        "instance": np.full(len(points), instance, np.int32),
+        "scan_id": points.scan_id,
+        "source_index": points.source_index,
+        "deviation": points.deviation,
+    }
+    fields = {name: column.dtype for name, column in columns.items()}
+    with open_writer(path, fields, shift=findings.shift, crs=findings.crs) as writer:
+        writer.write(points.xyz, columns)
+
+
+CSV_COLUMNS = (
+    "id", "model", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "score", "support", "visible_support", "penalty",
+    "coverage", "rms_m", "points", "deviation_mean_m", "deviation_rms_m", "deviation_p95_m", "deviation_worst_m",
+    "unobservable", "isolated",
+)  # fmt: skip
+
+
+def _write_csv(path: Path, results: schema.Results) -> None:
+    """One line a detection, for spreadsheets."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        out = csv.writer(file)
+        out.writerow(CSV_COLUMNS)
+        for found in results.detections:
+            q, deviation = found.quaternion, found.deviation
+            out.writerow(
+                [found.id, found.model, *found.translation_m, q.x, q.y, q.z, q.w, found.score, found.support]
+                + [found.visible_support, found.penalty, found.coverage, found.rms_m, found.points]
+                + ([""] * 4 if deviation is None else list(deviation.model_dump().values()))
+                + [" ".join(motion.kind for motion in found.unobservable), found.isolated or ""]
+            )
+
+
+def _files_under(folder: Path) -> set[str]:
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
+
+
+def _files_of(results: schema.Results) -> set[str]:
+    """What a result folder with this results.json holds."""
+    parts = [name for found in results.detections for name in (found.pose, found.isolated)]
+    return {RESULTS_JSON, RESULTS_CSV, MODELS, *(name for name in [*parts, results.remainder] if name)}
+
+
+def _swap(staged: Path, target: Path) -> None:
+    """Give the finished folder its name; an older result goes only when the new one stands."""
+    if not target.exists():
+        staged.rename(target)
+        return
+    older = target.with_name(f".{target.name}.{os.getpid()}.older")
+    target.rename(older)
+    try:
+        staged.rename(target)
+    except OSError:
+        older.rename(target)
+        raise
+    shutil.rmtree(older)
