@@ -1,0 +1,48 @@
+"""Which room is taken: voxels that tell whether a thing can stand somewhere."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.mesh import Mesh, doubled_areas
+
+Floats = NDArray[np.float64]
+
+VOXEL_M = 0.1
+# Nine or so points on each voxel face a surface crosses: few voxels are missed.
+POINTS_PER_M2 = 900.0
+
+
+class Occupancy:
+    """A room's voxels from (0, 0, 0) to `size`, metres; nothing is in it at first."""
+
+    def __init__(self, size: tuple[float, float, float]) -> None:
+        self.size = np.array(size)
+        self._taken = np.zeros(np.ceil(self.size / VOXEL_M).astype(int), dtype=bool)
+
+    def fits(self, points: Floats) -> bool:
+        """Whether a thing with these surface points (N, 3) stands inside the room and meets nothing."""
+        if (points < -1e-6).any() or (points > self.size + 1e-6).any():
+            return False
+        return not self._taken[self._cells(points)].any()
+
+    def take(self, points: Floats) -> None:
+        """Mark the room of a thing with these surface points (N, 3)."""
+        self._taken[self._cells(points)] = True
+
+    def _cells(self, points: Floats) -> tuple[NDArray[np.int64], ...]:
+        cells = np.clip((points / VOXEL_M).astype(np.int64), 0, np.array(self._taken.shape) - 1)
+        return tuple(cells.T)
+
+
+def surface_points(mesh: Mesh, rng: np.random.Generator, per_m2: float = POINTS_PER_M2) -> Floats:
+    """Points (N, 3) drawn evenly on a mesh's surface, mesh frame."""
+    areas = doubled_areas(mesh.vertices, mesh.faces) / 2
+    face = rng.choice(len(areas), size=max(1, int(areas.sum() * per_m2)), p=areas / areas.sum())
+    u, v = rng.random((2, len(face)))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    a, b, c = np.moveaxis(mesh.triangles()[face], 1, 0)
+    points: Floats = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    return points
