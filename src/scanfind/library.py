@@ -60,14 +60,27 @@ class ModelLibrary:
         sha256 = model_hash(model, parameters)
         with self._store.transaction():
             known = self._is_known(sha256, model.name)
-        if not known:
-            # Outside any transaction, because it takes seconds: others go on meanwhile, and may add the same model.
-            built = build_model(model, parameters)
-            with self._store.transaction(write=True):
-                if not self._is_known(sha256, model.name):
-                    self._store.insert(Record(sha256, built.name, _facts(built)), _arrays(built))
-                    return built
-        return self._join_placements(sha256, model.placements if isinstance(model, Mesh) else ())
+        if known:
+            return self._join_placements(sha256, model.placements if isinstance(model, Mesh) else ())
+        # Outside any transaction, because it takes seconds: others go on meanwhile, and may add the same model.
+        return self.put(build_model(model, parameters))
+
+    def put(self, model: Model) -> Model:
+        """Keep a model that is prepared already, such as one of another library; otherwise as `add`."""
+        with self._store.transaction(write=True):
+            if not self._is_known(model.sha256, model.name):
+                self._store.insert(Record(model.sha256, model.name, _facts(model)), _arrays(model))
+                return model
+        return self._join_placements(model.sha256, model.placements)
+
+    def put(self, model: Model) -> None:
+        """Keep a model that is prepared already, such as one of another library; no work where it is there.
+
+        Raises LibraryError where another model has the name.
+        """
+        with self._store.transaction(write=True):
+            if not self._is_known(model.sha256, model.name):
+                self._store.insert(Record(model.sha256, model.name, _facts(model)), _arrays(model))
 
     def remove(self, name: str) -> None:
         """Forget a model; raises LibraryError where there is none of that name."""
@@ -117,8 +130,8 @@ class ModelLibrary:
     def _is_known(self, sha256: str, name: str) -> bool:
         if self._store.by_hash(sha256):
             return True
-        if not name or not name.isprintable():
-            msg = f"a model needs a name that can be printed, got {name!r}; give it another"
+        if not name or not _is_text(name):
+            msg = f"a model needs a name that is text, got {name!r}; give it another"
             raise LibraryError(msg)
         if self._store.by_name(name):
             msg = f"model {name!r} is there already, of other geometry or parameters; remove it or rename the new one"
@@ -126,8 +139,7 @@ class ModelLibrary:
         return False
 
     def _named(self, name: str) -> Record:
-        # A name that cannot be printed may hold half a surrogate pair, which SQLite does not take; none is stored.
-        record = self._store.by_name(name) if name.isprintable() else None
+        record = self._store.by_name(name) if _is_text(name) else None
         if record is None:
             msg = f"no model {name!r} in the library; it has {', '.join(map(repr, self.names())) or 'none'}"
             raise LibraryError(msg)
@@ -177,6 +189,11 @@ class ModelLibrary:
             )
         except (KeyError, TypeError, ValueError):
             self._store.damaged(f"model {record.name!r}")
+
+
+def _is_text(name: str) -> bool:
+    """False for what Linux allows in a file name and SQLite does not take: bytes that are no UTF-8."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in name)
 
 
 def _facts(model: Model) -> dict[str, Any]:
