@@ -8,13 +8,13 @@ import numpy as np
 from numba import njit
 
 
-@njit(inline="always")
+@njit(cache=True, nogil=True)
 def angle_between(ax, ay, az, bx, by, bz):
     """Angle of two unit vectors, radians, 0 … π."""
     return acos(min(1.0, max(-1.0, ax * bx + ay * by + az * bz)))
 
 
-@njit(inline="always")
+@njit(cache=True, nogil=True)
 def feature_key(f1, f2, f3, angle_cell, angle_bins):
     """The cell of the 3D hash table a feature falls into (paper 3.2, Figure 6)."""
     b1 = min(angle_bins - 1, int(floor(f1 / angle_cell)))

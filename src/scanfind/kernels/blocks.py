@@ -1,0 +1,64 @@
+"""Addresses of cells: blocks of 8×8×8 cells found through an open-addressing hash of their packed coordinates.
+
+A hash rather than a dense table over the site's bounds: a stray point 5,000 km away costs one block, not a table of
+10^20 entries, and no site is too large to address (see decisions/0002-hashed-blocks.md).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+BIAS = 1 << 19  # block coordinates are packed as 20 bits an axis: ± 524,288 blocks, ± 84 km with cells of 2 cm
+EMPTY = np.int64(-1)
+
+
+@njit(cache=True, nogil=True)
+def pack_block(bx, by, bz):
+    """One int64 for a block's coordinates; the three lowest bits are left free (view octant)."""
+    return ((np.int64(bx) + BIAS) << 43) | ((np.int64(by) + BIAS) << 23) | ((np.int64(bz) + BIAS) << 3)
+
+
+@njit(cache=True, nogil=True)
+def unpack_block(key):
+    """The block coordinates `pack_block` was given."""
+    return (key >> 43) - BIAS, ((key >> 23) & 0xFFFFF) - BIAS, ((key >> 3) & 0xFFFFF) - BIAS
+
+
+@njit(cache=True, nogil=True)
+def hash_slot(key, mask):
+    """Where the search for a key starts (Fibonacci hashing; the high bits are the well-mixed ones)."""
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    return np.int64((mixed >> np.uint64(24)) & np.uint64(mask))
+
+
+@njit(cache=True, nogil=True)
+def find_block(keys, values, key):
+    """The value stored for a key, -1 where there is none."""
+    mask = keys.shape[0] - 1
+    slot = hash_slot(key, mask)
+    while True:
+        here = keys[slot]
+        if here == key:
+            return np.int64(values[slot])
+        if here == EMPTY:
+            return np.int64(-1)
+        slot = (slot + 1) & mask
+
+
+@njit(cache=True, nogil=True)
+def insert_block(keys, values, key, value):
+    """Store a value for a key that is not there yet; the table must have room."""
+    mask = keys.shape[0] - 1
+    slot = hash_slot(key, mask)
+    while keys[slot] != EMPTY:
+        slot = (slot + 1) & mask
+    keys[slot] = key
+    values[slot] = value
+
+
+@njit(cache=True, nogil=True)
+def fill_hash(block_keys, keys, values):
+    """Store value i for block_keys[i]; `keys` must come filled with EMPTY and be at least twice as long."""
+    for i in range(block_keys.shape[0]):
+        insert_block(keys, values, block_keys[i], i)

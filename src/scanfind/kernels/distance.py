@@ -1,0 +1,379 @@
+"""Nearest surface: a tree of boxes over triangles or samples, exact distances, and which raw points need one.
+
+Sources: nearest point of a triangle by its Voronoi regions, Ericson, "Real-Time Collision Detection" (2005), 5.1.5;
+sign at edges and corners, Bærentzen & Aanæs, "Signed distance computation using the angle weighted pseudonormal" (2005).
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+LEAF = 4  # primitives a leaf at most
+STACK = 64  # a depth-first descent holds at most one open node a level: enough for 2^64 primitives
+TILE = 256  # points that share one stack: its allocation would cost as much as a query
+
+# The parts of a triangle the nearest point may lie on.
+FACE, EDGE, CORNER = 0, 1, 4  # FACE; EDGE + 0, 1, 2: ab, bc, ca; CORNER + 0, 1, 2: a, b, c
+
+
+class NearSurface(NamedTuple):
+    """A surface that can be asked how far points are, and on which side; built by `scanfind.near_surface`.
+
+    A tree of boxes, not voxels with lists: it costs 200 bytes a triangle whatever the reach, where lists for triangles
+    of 3 mm and a reach of 1 cm would hold 400 entries a voxel.
+
+    corners : (F, 3, 3) model frame, metres, in the order of the tree; a sample is three times the same point
+    normals : (F, 3) unit, outwards; zero for a needle, which is measured as its edges
+    pseudonormals : (F, 6, 3) towards outside at edges ab, bc, ca and corners a, b, c; (0, 6, 3) for samples
+    face : (F,) the caller's number of each
+    boxes : (2 L, 6) low and high corner of node k, whose children are 2 k and 2 k + 1; 1 is the root, L … 2 L - 1 are
+        leaves, and leaf j has primitives F j // L … F (j + 1) // L; row 0 is unused
+    reach : farther than this, metres, nobody asks
+    spacing : distance of neighbouring samples, metres; 0 for triangles
+    signed : False where nobody knows which side is outside
+    """
+
+    corners: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    pseudonormals: NDArray[np.float32]
+    face: NDArray[np.int32]
+    boxes: NDArray[np.float64]
+    reach: float
+    spacing: float
+    signed: bool
+
+
+class Vicinity(NamedTuple):
+    """The cells of the scene near any placed surface: most raw points are in none and need no distance.
+
+    low : (3,) corner of the first block, shifted scene, metres
+    cell : edge of a cell, metres; a block has 8 × 8 × 8
+    top : (X, Y, Z) number of each block, -1 where no surface is near
+    bits : (B, 8) a byte of 64 bits for each x in a block: bit 8 y + z
+    """
+
+    low: NDArray[np.float64]
+    cell: float
+    top: NDArray[np.int32]
+    bits: NDArray[np.uint64]
+
+
+@njit(cache=True, nogil=True)
+def box_order(centres, leaves):
+    """Order (F,) of F centres (F, 3) such that every node of the tree halves its part along the longest side."""
+    n = len(centres)
+    order = np.arange(n)
+    level = 1
+    while level < leaves:
+        for k in range(level):
+            start, middle, stop = n * k // level, n * (2 * k + 1) // (2 * level), n * (k + 1) // level
+            axis, longest = 0, -1.0
+            for candidate in range(3):
+                low, high = np.inf, -np.inf
+                for i in range(start, stop):
+                    value = centres[order[i], candidate]
+                    low, high = min(low, value), max(high, value)
+                if high - low > longest:
+                    axis, longest = candidate, high - low
+            split_at(order, centres[:, axis], start, middle, stop)
+        level *= 2
+    return order
+
+
+@njit(cache=True, nogil=True)
+def split_at(order, values, start, middle, stop):
+    """Reorder order[start:stop] so that no value before `middle` is above any from there on (Hoare's selection)."""
+    low, high = start, stop - 1
+    while low < high:
+        pivot = values[order[(low + high) // 2]]
+        i, j = low, high
+        while i <= j:
+            while values[order[i]] < pivot:
+                i += 1
+            while values[order[j]] > pivot:
+                j -= 1
+            if i <= j:
+                order[i], order[j] = order[j], order[i]
+                i += 1
+                j -= 1
+        if middle <= j:
+            high = j
+        elif middle >= i:
+            low = i
+        else:
+            return
+
+
+@njit(cache=True, nogil=True)
+def box_tree(corners, leaves):
+    """The boxes (2 L, 6) of corners (F, 3, 3) that are in the order of the tree."""
+    n = len(corners)
+    boxes = np.empty((2 * leaves, 6))
+    boxes[:, :3], boxes[:, 3:] = np.inf, -np.inf
+    for j in range(leaves):
+        for f in range(n * j // leaves, n * (j + 1) // leaves):
+            for corner in range(3):
+                for k in range(3):
+                    value = corners[f, corner, k]
+                    boxes[leaves + j, k] = min(boxes[leaves + j, k], value)
+                    boxes[leaves + j, 3 + k] = max(boxes[leaves + j, 3 + k], value)
+    for node in range(leaves - 1, 0, -1):
+        for k in range(3):
+            boxes[node, k] = min(boxes[2 * node, k], boxes[2 * node + 1, k])
+            boxes[node, 3 + k] = max(boxes[2 * node, 3 + k], boxes[2 * node + 1, 3 + k])
+    return boxes
+
+
+@njit(inline="always")
+def to_box(boxes, node, x, y, z):
+    """Squared distance to a box; 0 inside."""
+    dx = max(boxes[node, 0] - x, 0.0, x - boxes[node, 3])
+    dy = max(boxes[node, 1] - y, 0.0, y - boxes[node, 4])
+    dz = max(boxes[node, 2] - z, 0.0, z - boxes[node, 5])
+    return dx * dx + dy * dy + dz * dz
+
+
+@njit(inline="always")
+def side(a, b, n, x, y, z):
+    """Not negative on the inner side of edge a → b of a triangle with normal n."""
+    ex, ey, ez = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    px, py, pz = x - a[0], y - a[1], z - a[2]
+    return n[0] * (ey * pz - ez * py) + n[1] * (ez * px - ex * pz) + n[2] * (ex * py - ey * px)
+
+
+@njit(inline="always")
+def comes_first(a, b):
+    """Whether point a comes before b by x, then y, then z."""
+    if a[0] != b[0]:
+        return a[0] < b[0]
+    if a[1] != b[1]:
+        return a[1] < b[1]
+    return a[2] < b[2]
+
+
+@njit(cache=True, nogil=True)
+def from_edge(a, b, x, y, z):
+    """From the nearest point of edge a → b to the point: (dx, dy, dz), and the end it lies on: 1 a, 2 b, 0 between.
+
+    Always measured from the end that comes first, so that the two triangles of an edge get the same bits and tie.
+    """
+    if not comes_first(a, b):
+        dx, dy, dz, end = from_first(b, a, x, y, z)
+        return dx, dy, dz, (3 - end) % 3
+    return from_first(a, b, x, y, z)
+
+
+@njit(inline="always")
+def from_first(a, b, x, y, z):
+    """As `from_edge`, measured from a."""
+    ex, ey, ez = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    px, py, pz = x - a[0], y - a[1], z - a[2]
+    along, whole = ex * px + ey * py + ez * pz, ex * ex + ey * ey + ez * ez
+    if along <= 0.0:
+        return px, py, pz, 1
+    if along >= whole:
+        return x - b[0], y - b[1], z - b[2], 2
+    t = along / whole
+    return px - t * ex, py - t * ey, pz - t * ez, 0
+
+
+@njit(cache=True, nogil=True)
+def to_triangle(corners, n, x, y, z):
+    """Squared distance to a triangle (3, 3) with unit normal n, and the part the nearest point lies on.
+
+    Inside or not is asked of the normal, not of barycentric coordinates: those are products of four lengths, and in a
+    triangle a millionth as high as long nothing is left of them.
+    """
+    a, b, c = corners[0], corners[1], corners[2]
+    needle = n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0
+    outside_ab, outside_bc, outside_ca = needle, needle, needle
+    if not needle:
+        outside_ab = side(a, b, n, x, y, z) < 0.0
+        outside_bc = side(b, c, n, x, y, z) < 0.0
+        outside_ca = side(c, a, n, x, y, z) < 0.0
+        if not (outside_ab or outside_bc or outside_ca):
+            d = n[0] * (x - a[0]) + n[1] * (y - a[1]) + n[2] * (z - a[2])
+            return d * d, FACE
+    best, part = np.inf, FACE
+    if outside_ab:
+        dx, dy, dz, end = from_edge(a, b, x, y, z)
+        best = dx * dx + dy * dy + dz * dz
+        part = EDGE if end == 0 else (CORNER if end == 1 else CORNER + 1)
+    if outside_bc:
+        dx, dy, dz, end = from_edge(b, c, x, y, z)
+        d2 = dx * dx + dy * dy + dz * dz
+        if d2 < best:
+            best, part = d2, EDGE + 1 if end == 0 else (CORNER + 1 if end == 1 else CORNER + 2)
+    if outside_ca:
+        dx, dy, dz, end = from_edge(c, a, x, y, z)
+        d2 = dx * dx + dy * dy + dz * dz
+        if d2 < best:
+            best, part = d2, EDGE + 2 if end == 0 else (CORNER + 2 if end == 1 else CORNER)
+    return best, part
+
+
+@njit(cache=True, nogil=True)
+def nearest(near, x, y, z, limit, enough, nodes, bounds):
+    """The nearest primitive within `limit`: (squared distance, its row or -1, the part); the lowest face where they tie.
+
+    enough : the first one of this squared distance or less will do
+    nodes, bounds : (STACK,) room for the nodes still to be opened and their squared distances
+    """
+    leaves, n = len(near.boxes) // 2, len(near.corners)
+    best, row, part = limit * limit, -1, FACE
+    nodes[0], bounds[0], waiting = 1, to_box(near.boxes, 1, x, y, z), 1
+    while waiting > 0:
+        waiting -= 1
+        node = nodes[waiting]
+        # The slack covers the rounding of two formulas for one distance: a tie must be opened, never lost.
+        if bounds[waiting] > best * (1.0 + 1e-9):
+            continue
+        while node < leaves:
+            node, other = 2 * node, 2 * node + 1
+            bound, other_bound = to_box(near.boxes, node, x, y, z), to_box(near.boxes, other, x, y, z)
+            if other_bound < bound:
+                node, other = other, node
+                bound, other_bound = other_bound, bound
+            if other_bound <= best * (1.0 + 1e-9):
+                nodes[waiting], bounds[waiting] = other, other_bound
+                waiting += 1
+            if bound > best * (1.0 + 1e-9):
+                break
+        if node < leaves:
+            continue
+        j = node - leaves
+        for f in range(n * j // leaves, n * (j + 1) // leaves):
+            if near.spacing > 0.0:
+                p = near.corners[f, 0]
+                d2, where = (x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2, FACE
+            else:
+                d2, where = to_triangle(near.corners[f], near.normals[f], x, y, z)
+            if d2 < best or (d2 == best and (row < 0 or near.face[f] < near.face[row])):
+                best, row, part = d2, f, where
+        if row >= 0 and best <= enough:
+            break
+    return best, row, part
+
+
+@njit(cache=True, nogil=True)
+def signed_distance(near, row, part, squared, x, y, z):
+    """Distance of a point to the primitive `nearest` found, + outside; NaN where it is out of reach after all."""
+    a, n = near.corners[row, 0], near.normals[row]
+    plane = n[0] * (x - a[0]) + n[1] * (y - a[1]) + n[2] * (z - a[2])
+    if near.spacing > 0.0:
+        # A sample stands for a small disk: beyond its rim there is no surface to measure.
+        if squared - plane * plane > near.spacing * near.spacing or abs(plane) > near.reach:
+            return np.nan
+        return plane if near.signed else abs(plane)
+    distance = sqrt(squared)
+    if not near.signed:
+        return distance
+    if part == FACE:
+        return plane
+    m = near.pseudonormals[row, part - EDGE]
+    if part >= CORNER:
+        p = near.corners[row, part - CORNER]
+        dx, dy, dz = x - p[0], y - p[1], z - p[2]
+    else:
+        p, q = near.corners[row, part - EDGE], near.corners[row, (part - EDGE + 1) % 3]
+        dx, dy, dz, _ = from_edge(p, q, x, y, z)
+    return distance if m[0] * dx + m[1] * dy + m[2] * dz >= 0.0 else -distance
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def distances(near, rotation, translation, shift, xyz, rows):
+    """Signed distances (K,) float32 of the points xyz[rows], NaN beyond reach, and the nearest faces (K,), -1 there.
+
+    rotation, translation : (3, 3), (3,) scene_from_model, where the scene is xyz - shift
+    """
+    k = len(rows)
+    distance, face = np.empty(k, np.float32), np.empty(k, np.int32)
+    limit = sqrt(near.reach**2 + near.spacing**2)
+    for tile in prange((k + TILE - 1) // TILE):
+        nodes, bounds = np.empty(STACK, np.int64), np.empty(STACK)
+        for i in range(tile * TILE, min(k, (tile + 1) * TILE)):
+            # In double precision, far coordinates first: at 5,000 km from the origin a digit is a nanometre.
+            p = xyz[rows[i]]
+            x, y, z = to_model(rotation, translation, p[0] - shift[0], p[1] - shift[1], p[2] - shift[2])
+            squared, row, part = nearest(near, x, y, z, limit, -1.0, nodes, bounds)
+            distance[i], face[i] = np.nan, -1
+            if row >= 0:
+                d = signed_distance(near, row, part, squared, x, y, z)
+                if d == d:  # not NaN
+                    distance[i], face[i] = d, near.face[row]
+    return distance, face
+
+
+@njit(cache=True, nogil=True)
+def to_model(rotation, translation, u, v, w):
+    """A point of the shifted scene in the frame of the model placed there by rotation (3, 3) and translation (3,)."""
+    u, v, w = u - translation[0], v - translation[1], w - translation[2]
+    x = rotation[0, 0] * u + rotation[1, 0] * v + rotation[2, 0] * w
+    y = rotation[0, 1] * u + rotation[1, 1] * v + rotation[2, 1] * w
+    z = rotation[0, 2] * u + rotation[1, 2] * v + rotation[2, 2] * w
+    return x, y, z
+
+
+@njit(cache=True, nogil=True)
+def mark_cells(near, rotation, translation, corner, cell, allowed, bits):
+    """Set the bits (8,) of the cells within `allowed` of a placed surface, in the block with this low corner (3,)."""
+    nodes, bounds = np.empty(STACK, np.int64), np.empty(STACK)
+    m = 0  # cells in Morton order: a half or quarter of the block that is far from the surface is skipped whole
+    while m < 512:
+        i = (m & 1) | (m >> 2 & 2) | (m >> 4 & 4)
+        j = (m >> 1 & 1) | (m >> 3 & 2) | (m >> 5 & 4)
+        k = (m >> 2 & 1) | (m >> 4 & 2) | (m >> 6 & 4)
+        size = 8 if m == 0 else (4 if m % 64 == 0 else (2 if m % 8 == 0 else 1))
+        while size > 0:
+            half = 0.5 * size * cell
+            u, v, w = corner[0] + i * cell + half, corner[1] + j * cell + half, corner[2] + k * cell + half
+            x, y, z = to_model(rotation, translation, u, v, w)
+            # Half the diagonal, and a millionth more for the rounding of cell addresses.
+            limit = allowed + sqrt(3.0) * half * (1.0 + 1e-6)
+            _, row, _ = nearest(near, x, y, z, limit, limit * limit, nodes, bounds)
+            if row < 0:
+                break
+            size //= 2
+        if size == 0:
+            bits[i] |= np.uint64(1) << np.uint64(8 * j + k)
+            m += 1
+        else:
+            m += size * size * size
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def cells_near(near, rotation, translation, low, cell, blocks, tolerance):
+    """The cells within `tolerance` of a placed surface as bits (B, 8) of the blocks with coordinates (B, 3)."""
+    bits = np.zeros((len(blocks), 8), np.uint64)
+    allowed = sqrt(tolerance**2 + near.spacing**2)
+    for b in prange(len(blocks)):
+        corner = low + 8.0 * cell * blocks[b]
+        mark_cells(near, rotation, translation, corner, cell, allowed, bits[b])
+    return bits
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def blocks_of(vicinity, shift, xyz):
+    """The block of each of N points whose cell is near a placed surface, (N,) int32; -1 for the many that are not."""
+    n = len(xyz)
+    block = np.empty(n, np.int32)
+    top, bits = vicinity.top, vicinity.bits
+    per_cell = 1.0 / vicinity.cell
+    size_x, size_y, size_z = 8.0 * top.shape[0], 8.0 * top.shape[1], 8.0 * top.shape[2]
+    for i in prange(n):
+        found = -1
+        x = ((xyz[i, 0] - shift[0]) - vicinity.low[0]) * per_cell
+        y = ((xyz[i, 1] - shift[1]) - vicinity.low[1]) * per_cell
+        z = ((xyz[i, 2] - shift[2]) - vicinity.low[2]) * per_cell
+        if 0.0 <= x < size_x and 0.0 <= y < size_y and 0.0 <= z < size_z:
+            ix, iy, iz = int(x), int(y), int(z)
+            b = top[ix >> 3, iy >> 3, iz >> 3]
+            if b >= 0 and bits[b, ix & 7] >> np.uint64(8 * (iy & 7) + (iz & 7)) & np.uint64(1):
+                found = b
+        block[i] = found
+    return block

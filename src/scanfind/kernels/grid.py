@@ -1,0 +1,166 @@
+"""The streaming pass: raw points → integer moments a cell and a view octant, and the nearest range a view direction.
+
+Sums are integers (offsets in 1/65536 of a cell), so they do not depend on the order of addition: chunks, threads,
+files and workers may add in any order and the result is the same to the last bit.
+"""
+
+from __future__ import annotations
+
+from math import floor, sqrt
+
+import numpy as np
+from numba import njit
+
+from scanfind.kernels.blocks import BIAS, find_block, insert_block, pack_block, unpack_block
+
+MOMENTS = 13  # n, Σx Σy Σz, Σxx Σxy Σxz Σyy Σyz Σzz, Σ direction to the scanner (3)
+OFFSET_UNITS = 65536.0  # offsets within a cell are counted in 1/65536 of its edge: 0.3 µm in a cell of 2 cm
+DIRECTION_UNITS = 1048576.0
+
+
+@njit(cache=True, nogil=True)
+def cube_pixel(x, y, z, edge):
+    """The pixel of a cube map of 6 × edge × edge a direction (any length but 0) falls into."""
+    ax, ay, az = abs(x), abs(y), abs(z)
+    if ax >= ay and ax >= az:
+        face, major, u, v = (0 if x > 0 else 1), ax, y, z
+    elif ay >= az:
+        face, major, u, v = (2 if y > 0 else 3), ay, x, z
+    else:
+        face, major, u, v = (4 if z > 0 else 5), az, x, y
+    iu = min(edge - 1, int((u / major + 1.0) * 0.5 * edge))
+    iv = min(edge - 1, int((v / major + 1.0) * 0.5 * edge))
+    return (face * edge + iu) * edge + iv
+
+
+@njit(cache=True, nogil=True)
+def accumulate(
+    points, start, origin, has_origin, offset, cell,
+    hash_keys, hash_values, block_keys, block_cells, moments, counts, depth, depth_edge,
+):  # fmt: skip
+    """Add points[start:] to the grid; returns how far it came: len(points), or less where an array is full.
+
+    offset : (3,) the grid's own origin, the points' frame
+    hash_keys, hash_values : open addressing, power of two
+    block_keys : (B,) packed block and octant; block_cells : (B, 512) row of moments, -1 for an empty cell
+    counts : [blocks used, rows used, points too far away to be addressed]
+    depth : (6·edge²,) nearest range seen in each direction, metres (inf where none); only if has_origin
+    """
+    inverse = 1.0 / cell
+    n = points.shape[0]
+    last_key = np.int64(-1)
+    last_block = np.int64(-1)
+    octant = 0
+    dx = dy = dz = 0.0
+    for i in range(start, n):
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        gx, gy, gz = (px - offset[0]) * inverse, (py - offset[1]) * inverse, (pz - offset[2]) * inverse
+        fx, fy, fz = floor(gx), floor(gy), floor(gz)
+        if not (abs(fx) < 8 * (BIAS - 2) and abs(fy) < 8 * (BIAS - 2) and abs(fz) < 8 * (BIAS - 2)):
+            counts[2] += 1
+            continue
+        cx, cy, cz = np.int64(fx), np.int64(fy), np.int64(fz)
+        if has_origin:
+            dx, dy, dz = origin[0] - px, origin[1] - py, origin[2] - pz
+            octant = (1 if dx > 0 else 0) | (2 if dy > 0 else 0) | (4 if dz > 0 else 0)
+        key = pack_block(cx >> 3, cy >> 3, cz >> 3) | octant
+        if key != last_key:
+            last_block = find_block(hash_keys, hash_values, key)
+            if last_block < 0:
+                if counts[0] == block_keys.shape[0]:
+                    return i
+                last_block = counts[0]
+                block_keys[last_block] = key
+                block_cells[last_block, :] = -1
+                insert_block(hash_keys, hash_values, key, last_block)
+                counts[0] += 1
+            last_key = key
+        local = ((cx & 7) << 6) | ((cy & 7) << 3) | (cz & 7)
+        row = block_cells[last_block, local]
+        if row < 0:
+            if counts[1] == moments.shape[0]:
+                return i
+            row = counts[1]
+            counts[1] += 1
+            block_cells[last_block, local] = row
+            moments[row, :] = 0
+        ox = np.int64(floor((gx - fx - 0.5) * OFFSET_UNITS + 0.5))
+        oy = np.int64(floor((gy - fy - 0.5) * OFFSET_UNITS + 0.5))
+        oz = np.int64(floor((gz - fz - 0.5) * OFFSET_UNITS + 0.5))
+        m = moments[row]
+        m[0] += 1
+        m[1] += ox
+        m[2] += oy
+        m[3] += oz
+        m[4] += ox * ox
+        m[5] += ox * oy
+        m[6] += ox * oz
+        m[7] += oy * oy
+        m[8] += oy * oz
+        m[9] += oz * oz
+        if has_origin:
+            distance = sqrt(dx * dx + dy * dy + dz * dz)
+            if distance > 0.0:
+                scale = DIRECTION_UNITS / distance
+                m[10] += np.int64(dx * scale)
+                m[11] += np.int64(dy * scale)
+                m[12] += np.int64(dz * scale)
+                pixel = cube_pixel(-dx, -dy, -dz, depth_edge)
+                depth[pixel] = min(depth[pixel], np.float32(distance))
+    return n
+
+
+@njit(cache=True, nogil=True)
+def sum_children(
+    start, child_keys, child_cells, child_moments, half,
+    hash_keys, hash_values, block_keys, block_cells, moments, counts,
+):  # fmt: skip
+    """Sum cells into cells of twice the edge, from child block `start` on; returns how far it came (see accumulate).
+
+    half : half a child's edge in offset units: a child's centre lies so far from its parent's, along each axis
+    """
+    for child in range(start, child_keys.shape[0]):
+        # A child block fills one octant of its parent: at most one new block and 64 new rows.
+        if counts[0] + 1 > block_keys.shape[0] or counts[1] + 64 > moments.shape[0]:
+            return child
+        bx, by, bz = unpack_block(child_keys[child])
+        key = pack_block(bx >> 1, by >> 1, bz >> 1) | (child_keys[child] & 7)
+        block = find_block(hash_keys, hash_values, key)
+        if block < 0:
+            block = counts[0]
+            block_keys[block] = key
+            block_cells[block, :] = -1
+            insert_block(hash_keys, hash_values, key, block)
+            counts[0] += 1
+        for local in range(512):
+            child_row = child_cells[child, local]
+            if child_row < 0:
+                continue
+            lx, ly, lz = local >> 6, (local >> 3) & 7, local & 7
+            px, py, pz = ((bx & 1) << 2) | (lx >> 1), ((by & 1) << 2) | (ly >> 1), ((bz & 1) << 2) | (lz >> 1)
+            parent = (px << 6) | (py << 3) | pz
+            row = block_cells[block, parent]
+            if row < 0:
+                row = counts[1]
+                counts[1] += 1
+                block_cells[block, parent] = row
+                moments[row, :] = 0
+            ex = half if lx & 1 else -half
+            ey = half if ly & 1 else -half
+            ez = half if lz & 1 else -half
+            m, p = child_moments[child_row], moments[row]
+            n, sx, sy, sz = m[0], m[1], m[2], m[3]
+            p[0] += n
+            p[1] += sx + n * ex
+            p[2] += sy + n * ey
+            p[3] += sz + n * ez
+            p[4] += m[4] + 2 * ex * sx + n * ex * ex
+            p[5] += m[5] + ex * sy + ey * sx + n * ex * ey
+            p[6] += m[6] + ex * sz + ez * sx + n * ex * ez
+            p[7] += m[7] + 2 * ey * sy + n * ey * ey
+            p[8] += m[8] + ey * sz + ez * sy + n * ey * ez
+            p[9] += m[9] + 2 * ez * sz + n * ez * ez
+            p[10] += m[10]
+            p[11] += m[11]
+            p[12] += m[12]
+    return child_keys.shape[0]

@@ -1,0 +1,53 @@
+"""The surfel a placed model point lies on: nearest in the 3×3×3 cells around it, with a like normal."""
+
+from __future__ import annotations
+
+from math import floor
+
+import numpy as np
+from numba import njit
+
+from scanfind.kernels.blocks import find_block, pack_block
+
+
+@njit(cache=True, nogil=True)
+def nearest_surfel(
+    x, y, z, nx, ny, nz, gate, least_cosine, signed,
+    cell, hash_keys, hash_values, block_cells, first_surfel, means, normals,
+):  # fmt: skip
+    """The nearest surfel within `gate` metres whose normal agrees, -1 where there is none.
+
+    least_cosine : of the angle between normals; by magnitude where the scene's normals are not signed
+    """
+    inverse = 1.0 / cell
+    gx, gy, gz = x * inverse, y * inverse, z * inverse
+    cx, cy, cz = np.int64(floor(gx)), np.int64(floor(gy)), np.int64(floor(gz))
+    best, nearest = np.int64(-1), gate * gate
+    # The eight nearest of the 27 cells hold everything within half a cell; the others only matter for wider gates.
+    wide = gate > 0.5 * cell
+    x0, x1 = (cx - 1, cx + 1) if wide else (cx - (1 if gx - cx < 0.5 else 0), cx + (0 if gx - cx < 0.5 else 1))
+    y0, y1 = (cy - 1, cy + 1) if wide else (cy - (1 if gy - cy < 0.5 else 0), cy + (0 if gy - cy < 0.5 else 1))
+    z0, z1 = (cz - 1, cz + 1) if wide else (cz - (1 if gz - cz < 0.5 else 0), cz + (0 if gz - cz < 0.5 else 1))
+    key, block = np.int64(-1), np.int64(-1)
+    for ix in range(x0, x1 + 1):
+        for iy in range(y0, y1 + 1):
+            for iz in range(z0, z1 + 1):
+                here = pack_block(ix >> 3, iy >> 3, iz >> 3)
+                if here != key:
+                    key = here
+                    block = find_block(hash_keys, hash_values, key)
+                if block < 0:
+                    continue
+                found = block_cells[block, ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7)]
+                if found < 0:
+                    continue
+                for s in range(first_surfel[found], first_surfel[found + 1]):
+                    dx, dy, dz = means[s, 0] - x, means[s, 1] - y, means[s, 2] - z
+                    squared = dx * dx + dy * dy + dz * dz
+                    if squared >= nearest:
+                        continue
+                    cosine = nx * normals[s, 0] + ny * normals[s, 1] + nz * normals[s, 2]
+                    if cosine < least_cosine and (signed or -cosine < least_cosine):
+                        continue
+                    best, nearest = s, squared
+    return best

@@ -1,0 +1,243 @@
+"""RANSAC's inner loops: draw pairs of scene points, look them up, pose each hypothesis, test it sequentially."""
+
+from __future__ import annotations
+
+from math import cos, floor, pi, sin, sqrt
+
+import numpy as np
+from numba import njit
+
+from scanfind.kernels.blocks import find_block, pack_block
+from scanfind.kernels.features import angle_between, feature_key
+from scanfind.kernels.grid import cube_pixel
+from scanfind.kernels.pair_pose import frame_of_pair, place_pair, pose_from_frames, refine_four_points
+
+NORMAL_BINS = 3  # a normal's bin is one of 6 cube faces × 3 × 3, about 30° wide: 54 bits of a cell's 64-bit mask
+
+
+@njit(cache=True, nogil=True)
+def random_bits(seed, stream, counter):
+    """64 random bits of (seed, stream, counter): splitmix64's finaliser over a Weyl sequence.
+
+    Counter-based, so that a draw is the same whichever thread makes it.
+    """
+    x = np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(stream) * np.uint64(0xD1B54A32D192ED03)
+    x += np.uint64(counter) * np.uint64(0x8CB92BA72F3D8DD7)
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))
+
+
+@njit(cache=True, nogil=True)
+def unit_interval(bits):
+    """Uniform in [0, 1) from the upper 53 of 64 bits."""
+    return float(bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
+
+
+@njit(cache=True, nogil=True)
+def draw_pairs(
+    start, stop, seed, stream, candidates, distance, max_tries, cell, hash_keys, hash_values, block_cells,
+    first_surfel, means, normals, first, second, tries,
+):  # fmt: skip
+    """Draw pairs number start … stop: s1 among the candidates, s2 by random directions on the sphere of radius d.
+
+    candidates : (W,) surfels that may be s1; cell, hash_*, block_cells, first_surfel : the grid (see Surfels)
+    first, second : out, surfels of each pair, -1 where max_tries directions met no surfel with a normal
+    tries : out, directions taken
+    """
+    inverse = 1.0 / cell
+    for k in range(start, stop):
+        bits = random_bits(seed, stream, k * 1024)
+        one = candidates[np.int64(unit_interval(bits) * candidates.shape[0])]
+        first[k] = one
+        second[k] = -1
+        tries[k] = max_tries
+        for attempt in range(max_tries):
+            z = 2.0 * unit_interval(random_bits(seed, stream, k * 1024 + 2 * attempt + 1)) - 1.0
+            azimuth = 2.0 * pi * unit_interval(random_bits(seed, stream, k * 1024 + 2 * attempt + 2))
+            across = distance * sqrt(1.0 - z * z)
+            cx = np.int64(floor((means[one, 0] + across * cos(azimuth)) * inverse))
+            cy = np.int64(floor((means[one, 1] + across * sin(azimuth)) * inverse))
+            cz = np.int64(floor((means[one, 2] + distance * z) * inverse))
+            block = find_block(hash_keys, hash_values, pack_block(cx >> 3, cy >> 3, cz >> 3))
+            if block < 0:
+                continue
+            found = block_cells[block, ((cx & 7) << 6) | ((cy & 7) << 3) | (cz & 7)]
+            if found < 0:
+                continue
+            # A cell with two faces offers both in turn.
+            two = first_surfel[found] + attempt % (first_surfel[found + 1] - first_surfel[found])
+            if normals[two, 0] == 0.0 and normals[two, 1] == 0.0 and normals[two, 2] == 0.0:
+                continue
+            second[k] = two
+            tries[k] = attempt + 1
+            break
+
+
+@njit(cache=True, nogil=True)
+def key_pairs(first, second, signs, means, normals, angle_cell, angle_bins, keys):
+    """The feature cell of each of K scene pairs, -1 for a pair that is none; signs: bit 0 turns n1, bit 1 turns n2."""
+    for k in range(first.shape[0]):
+        keys[k] = -1
+        if second[k] < 0:
+            continue
+        p, q, a, b = means[first[k]], means[second[k]], normals[first[k]], normals[second[k]]
+        dx, dy, dz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+        length = sqrt(dx * dx + dy * dy + dz * dz)
+        if length <= 0.0:
+            continue
+        dx, dy, dz = dx / length, dy / length, dz / length
+        sa, sb = 1.0 - 2.0 * (signs[k] & 1), 1.0 - (signs[k] & 2)
+        f1 = angle_between(sa * a[0], sa * a[1], sa * a[2], dx, dy, dz)
+        f2 = angle_between(sb * b[0], sb * b[1], sb * b[2], dx, dy, dz)
+        f3 = angle_between(sa * a[0], sa * a[1], sa * a[2], sb * b[0], sb * b[1], sb * b[2])
+        keys[k] = feature_key(f1, f2, f3, angle_cell, angle_bins)
+
+
+@njit(cache=True, nogil=True)
+def normal_bit(x, y, z):
+    """The bit of a direction in an orientation mask."""
+    return np.uint64(1) << np.uint64(cube_pixel(x, y, z, NORMAL_BINS))
+
+
+@njit(cache=True, nogil=True)
+def mark_orientations(means, normals, reach, cell, spread, signed, hash_keys, hash_values, block_keys, masks, counts):
+    """Mark each surfel's normal in the cells it supports: where it is, and up to `reach` along its normal.
+
+        spread : radians; the bins of the normal and of eight directions so far around it are set
+        block_keys : (B,), masks : (B, 512) uint64, grown by the caller; counts[0] : blocks used
+    Returns the surfel it stopped at because blocks ran out, else their number.
+    """
+    inverse = 1.0 / cell
+    for i in range(counts[1], means.shape[0]):
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+        if nx == 0.0 and ny == 0.0 and nz == 0.0:
+            continue
+        if counts[0] + 5 > block_keys.shape[0]:
+            counts[1] = i
+            return i
+        # Two directions across the normal, then a ring of eight around it.
+        if abs(nx) < 0.6:
+            ux, uy, uz = 0.0, nz, -ny
+        else:
+            ux, uy, uz = -nz, 0.0, nx
+        size = sqrt(ux * ux + uy * uy + uz * uz)
+        ux, uy, uz = ux / size, uy / size, uz / size
+        vx, vy, vz = ny * uz - nz * uy, nz * ux - nx * uz, nx * uy - ny * ux
+        mask = normal_bit(nx, ny, nz)
+        c, s = cos(spread), sin(spread)
+        for k in range(8):
+            p, q = s * cos(k * pi / 4.0), s * sin(k * pi / 4.0)
+            x, y, z = c * nx + p * ux + q * vx, c * ny + p * uy + q * vy, c * nz + p * uz + q * vz
+            mask |= normal_bit(x, y, z)
+            if not signed:
+                mask |= normal_bit(-x, -y, -z)
+        if not signed:
+            mask |= normal_bit(-nx, -ny, -nz)
+        for k in range(-2, 3):
+            along = 0.5 * k * reach
+            cx = np.int64(floor((means[i, 0] + along * nx) * inverse))
+            cy = np.int64(floor((means[i, 1] + along * ny) * inverse))
+            cz = np.int64(floor((means[i, 2] + along * nz) * inverse))
+            key = pack_block(cx >> 3, cy >> 3, cz >> 3)
+            block = find_block(hash_keys, hash_values, key)
+            if block < 0:
+                block = counts[0]
+                counts[0] += 1
+                block_keys[block] = key
+                masks[block, :] = 0
+                at = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+                slot = np.int64((at >> np.uint64(24)) & np.uint64(hash_keys.shape[0] - 1))
+                while hash_keys[slot] != -1:
+                    slot = (slot + 1) & (hash_keys.shape[0] - 1)
+                hash_keys[slot] = key
+                hash_values[slot] = block
+            masks[block, ((cx & 7) << 6) | ((cy & 7) << 3) | (cz & 7)] |= mask
+    counts[1] = means.shape[0]
+    return means.shape[0]
+
+
+@njit(cache=True, nogil=True)
+def lies_on_scene(point, normal, rotation, translation, inverse, hash_keys, hash_values, masks):
+    """Does a placed model point lie in a cell marked with its normal's direction?"""
+    x = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
+    y = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
+    z = rotation[2, 0] * point[0] + rotation[2, 1] * point[1] + rotation[2, 2] * point[2] + translation[2]
+    cx, cy, cz = np.int64(floor(x * inverse)), np.int64(floor(y * inverse)), np.int64(floor(z * inverse))
+    block = find_block(hash_keys, hash_values, pack_block(cx >> 3, cy >> 3, cz >> 3))
+    if block < 0:
+        return False
+    mask = masks[block, ((cx & 7) << 6) | ((cy & 7) << 3) | (cz & 7)]
+    if mask == 0:
+        return False
+    return mask & normal_bit(
+        rotation[0, 0] * normal[0] + rotation[0, 1] * normal[1] + rotation[0, 2] * normal[2],
+        rotation[1, 0] * normal[0] + rotation[1, 1] * normal[1] + rotation[1, 2] * normal[2],
+        rotation[2, 0] * normal[0] + rotation[2, 1] * normal[1] + rotation[2, 2] * normal[2],
+    ) != np.uint64(0)  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def test_pairs(
+    start, stop, pair_first, pair_second, pair_signs, pair_keys, means, normals,
+    offsets, entry_model, entry_first, entry_second, model_starts, model_points, model_normals, skip_model,
+    length, cell, hash_keys, hash_values, masks, least_hits,
+    best_hits, best_model, best_rotation, best_translation, work,
+):  # fmt: skip
+    """Test every hypothesis of scene pairs start … stop; keep the best of each pair.
+
+    offsets, entry_* : the library's hash table in CSR form; entry_first, entry_second : samples of entry_model
+    model_starts : (models+1,) where each model's samples begin in model_points, model_normals
+    skip_model : (models,) True for models no longer sought
+    length : metres, of the normals in the four-point sets; 0 for the limit (see pair_pose)
+    least_hits : (T+1,) Wald's test as a table: after k points fewer hits than least_hits[k] end it
+    best_hits : out, hits among T points; 0 where no hypothesis passed
+    work : (2,) out, hypotheses and look-ups
+    """
+    inverse = 1.0 / cell
+    scene, model = np.empty((4, 4)), np.empty((4, 4))
+    rotation, translation = np.empty((3, 3)), np.empty(3)
+    b1, b2 = np.empty(3), np.empty(3)
+    last = least_hits.shape[0] - 1
+    for k in range(start, stop):
+        best_hits[k] = 0
+        i, j = pair_first[k], pair_second[k]
+        s1, s2 = means[i], means[j]
+        sa, sb = 1.0 - 2.0 * (pair_signs[k] & 1), 1.0 - (pair_signs[k] & 2)
+        for c in range(3):
+            b1[c], b2[c] = sa * normals[i, c], sb * normals[j, c]
+        frame_of_pair(s1, b1, s2, b2, scene)
+        for entry in range(offsets[pair_keys[k]], offsets[pair_keys[k] + 1]):
+            which = entry_model[entry]
+            if skip_model[which]:
+                continue
+            base, n = model_starts[which], model_starts[which + 1] - model_starts[which]
+            m1, m2 = model_points[base + entry_first[entry]], model_points[base + entry_second[entry]]
+            a1, a2 = model_normals[base + entry_first[entry]], model_normals[base + entry_second[entry]]
+            frame_of_pair(m1, a1, m2, a2, model)
+            if not pose_from_frames(model, scene, rotation):
+                continue
+            if length > 0.0:
+                refine_four_points(m1, a1, m2, a2, s1, b1, s2, b2, length, rotation)
+            place_pair(m1, a1, m2, a2, s1, b1, s2, b2, length, rotation, translation)
+            work[0] += 1
+            hits = 0
+            for t in range(last):
+                # A model with fewer samples than the test has points is gone through again.
+                at = base + t % n
+                if lies_on_scene(
+                    model_points[at], model_normals[at], rotation, translation, inverse, hash_keys, hash_values, masks
+                ):
+                    hits += 1
+                if hits < least_hits[t + 1]:
+                    work[1] += t + 1
+                    hits = -1
+                    break
+            if hits < 0:
+                continue
+            work[1] += last
+            if hits > best_hits[k]:
+                best_hits[k] = hits
+                best_model[k] = which
+                best_rotation[k] = rotation
+                best_translation[k] = translation

@@ -1,0 +1,231 @@
+"""Moments → surfels: the mean and the oriented normal of each cell, one for each side the scanners saw."""
+
+from __future__ import annotations
+
+from math import acos, cos, pi, sqrt
+
+import numpy as np
+from numba import njit
+
+from scanfind.kernels.blocks import find_block, pack_block, unpack_block
+from scanfind.kernels.grid import MOMENTS
+
+
+@njit(cache=True, nogil=True)
+def smallest_eigenvector(a00, a01, a02, a11, a12, a22):
+    """Unit eigenvector of the smallest eigenvalue of a symmetric 3×3 matrix, and the three eigenvalues, ascending.
+
+    Trigonometric solution of the characteristic cubic; the vector is the largest cross product of two rows of
+    A - λI, which is accurate whenever λ is simple. A multiple of the identity gives z.
+    """
+    mean = (a00 + a11 + a22) / 3.0
+    b00, b11, b22 = a00 - mean, a11 - mean, a22 - mean
+    p = (b00 * b00 + b11 * b11 + b22 * b22 + 2.0 * (a01 * a01 + a02 * a02 + a12 * a12)) / 6.0
+    if p <= 1e-30 * mean * mean + 1e-300:
+        return 0.0, 0.0, 1.0, mean, mean, mean
+    p = sqrt(p)
+    determinant = (b00 * (b11 * b22 - a12 * a12) - a01 * (a01 * b22 - a12 * a02) + a02 * (a01 * a12 - b11 * a02)) / (
+        2.0 * p * p * p
+    )
+    phi = acos(min(1.0, max(-1.0, determinant))) / 3.0
+    high = mean + 2.0 * p * cos(phi)
+    low = mean + 2.0 * p * cos(phi + 2.0 * pi / 3.0)
+    c00, c11, c22 = a00 - low, a11 - low, a22 - low
+    x1, y1, z1 = a01 * a12 - a02 * c11, a02 * a01 - c00 * a12, c00 * c11 - a01 * a01
+    x2, y2, z2 = a01 * c22 - a02 * a12, a02 * a02 - c00 * c22, c00 * a12 - a01 * a02
+    x3, y3, z3 = c11 * c22 - a12 * a12, a12 * a02 - a01 * c22, a01 * a12 - c11 * a02
+    n1, n2, n3 = x1 * x1 + y1 * y1 + z1 * z1, x2 * x2 + y2 * y2 + z2 * z2, x3 * x3 + y3 * y3 + z3 * z3
+    if n1 >= n2 and n1 >= n3:
+        x, y, z, n = x1, y1, z1, n1
+    elif n2 >= n3:
+        x, y, z, n = x2, y2, z2, n2
+    else:
+        x, y, z, n = x3, y3, z3, n3
+    if n <= 1e-300:
+        return 0.0, 0.0, 1.0, low, 3.0 * mean - low - high, high
+    n = sqrt(n)
+    return x / n, y / n, z / n, low, 3.0 * mean - low - high, high
+
+
+@njit(cache=True, nogil=True)
+def count_cells(slot_starts, slot_cells):
+    """Occupied cells of each block, whatever octant they were seen from, (B,).
+
+    slot_starts : (B+1,) which slots (block × octant) belong to each block
+    slot_cells : (slots, 512) row of moments, -1 for empty
+    """
+    counts = np.zeros(slot_starts.shape[0] - 1, np.int64)
+    for block in range(counts.shape[0]):
+        for local in range(512):
+            for slot in range(slot_starts[block], slot_starts[block + 1]):
+                if slot_cells[slot, local] >= 0:
+                    counts[block] += 1
+                    break
+    return counts
+
+
+@njit(cache=True, nogil=True)
+def number_cells(slot_starts, slot_cells, first_cell, moments, block_cells, cell_locals, totals):
+    """Number the cells block by block and sum their octants.
+
+    block_cells : (B, 512) out: number of each cell, -1 for empty
+    totals : (V, 13) out: moments of each cell, all octants together
+    """
+    for block in range(slot_starts.shape[0] - 1):
+        cell = first_cell[block]
+        for local in range(512):
+            block_cells[block, local] = -1
+            occupied = False
+            for slot in range(slot_starts[block], slot_starts[block + 1]):
+                row = slot_cells[slot, local]
+                if row >= 0:
+                    if not occupied:
+                        totals[cell, :] = moments[row]
+                        occupied = True
+                    else:
+                        totals[cell] += moments[row]
+            if occupied:
+                block_cells[block, local] = cell
+                cell_locals[cell] = local
+                cell += 1
+
+
+@njit(cache=True, nogil=True)
+def add_moved(pool, m, ex, ey, ez):
+    """Add moments m, about a cell centre at offset e, to the pool about its own centre (offset units)."""
+    n = float(m[0])
+    sx, sy, sz = float(m[1]), float(m[2]), float(m[3])
+    pool[0] += n
+    pool[1] += sx + n * ex
+    pool[2] += sy + n * ey
+    pool[3] += sz + n * ez
+    pool[4] += m[4] + 2.0 * ex * sx + n * ex * ex
+    pool[5] += m[5] + ex * sy + ey * sx + n * ex * ey
+    pool[6] += m[6] + ex * sz + ez * sx + n * ex * ez
+    pool[7] += m[7] + 2.0 * ey * sy + n * ey * ey
+    pool[8] += m[8] + ey * sz + ez * sy + n * ey * ez
+    pool[9] += m[9] + 2.0 * ez * sz + n * ez * ez
+    pool[10] += m[10]
+    pool[11] += m[11]
+    pool[12] += m[12]
+
+
+@njit(cache=True, nogil=True)
+def plane_of(pool):
+    """Normal and eigenvalues of pooled moments."""
+    n = pool[0]
+    mx, my, mz = pool[1] / n, pool[2] / n, pool[3] / n
+    return smallest_eigenvector(
+        pool[4] / n - mx * mx, pool[5] / n - mx * my, pool[6] / n - mx * mz,
+        pool[7] / n - my * my, pool[8] / n - my * mz, pool[9] / n - mz * mz,
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def fit_surfels(
+    first_block, last_block, block_keys, hash_keys, hash_values, slot_starts, slot_cells, moments,
+    block_cells, first_cell, cell_locals, totals, cell, units, min_neighbours,
+    n_sides, means, normals, flatness, weights,
+):  # fmt: skip
+    """Fit one or two surfels in every cell of some blocks.
+
+    cell : edge, metres; units : offset units a cell; min_neighbours : occupied cells of the 3×3×3 a normal needs, the cell itself included
+    n_sides : (V,) out: 1, or 2 where the scanners saw both faces of something thin
+    means : (V, 2, 3) out: metres from the grid's offset
+    normals : (V, 2, 3) out: unit, towards the scanner; zero where there are too few neighbours
+    flatness : (V, 2) out: standard deviation across the pooled plane, metres; weights : (V, 2) out: points
+    """
+    unit = cell / units
+    pool = np.zeros(MOMENTS)
+    side = np.zeros(MOMENTS)
+    around = np.empty(27, np.int64)
+    neighbour_cell = np.empty(27, np.int64)
+    neighbour_block = np.empty(27, np.int64)
+    neighbour_local = np.empty(27, np.int64)
+    for block in range(first_block, last_block):
+        bx, by, bz = unpack_block(block_keys[block])
+        for k in range(27):
+            key = pack_block(bx + k // 9 - 1, by + k // 3 % 3 - 1, bz + k % 3 - 1)
+            around[k] = block if k == 13 else find_block(hash_keys, hash_values, key)
+        for c in range(first_cell[block], first_cell[block + 1]):
+            local = np.int64(cell_locals[c])
+            lx, ly, lz = local >> 6, (local >> 3) & 7, local & 7
+            pool[:] = 0.0
+            occupied = 0
+            for k in range(27):
+                ix, iy, iz = lx + k // 9 - 1, ly + k // 3 % 3 - 1, lz + k % 3 - 1
+                other = around[((ix >> 3) + 1) * 9 + ((iy >> 3) + 1) * 3 + (iz >> 3) + 1]
+                neighbour_cell[k] = -1
+                if other >= 0:
+                    there = ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7)
+                    found = block_cells[other, there]
+                    neighbour_cell[k] = found
+                    neighbour_block[k] = other
+                    neighbour_local[k] = there
+                    if found >= 0:
+                        occupied += 1
+                        add_moved(
+                            pool, totals[found],
+                            (k // 9 - 1) * units, (k // 3 % 3 - 1) * units, (k % 3 - 1) * units,
+                        )  # fmt: skip
+            nx, ny, nz, low, _, _ = plane_of(pool)
+            own = totals[c]
+            cx, cy, cz = ((bx << 3) + lx + 0.5) * cell, ((by << 3) + ly + 0.5) * cell, ((bz << 3) + lz + 0.5) * cell
+
+            # A thin plate scanned from both sides: the sums of directions of its octants disagree about the side.
+            front = back = 0.0
+            for slot in range(slot_starts[block], slot_starts[block + 1]):
+                row = slot_cells[slot, local]
+                if row >= 0:
+                    m = moments[row]
+                    along = m[10] * nx + m[11] * ny + m[12] * nz
+                    if along > 0.0:
+                        front += m[0]
+                    elif along < 0.0:
+                        back += m[0]
+            two = occupied >= min_neighbours and min(front, back) >= max(2.0, 0.1 * own[0])
+            n_sides[c] = 2 if two else 1
+            if not two:
+                means[c, 0, 0] = cx + own[1] / own[0] * unit
+                means[c, 0, 1] = cy + own[2] / own[0] * unit
+                means[c, 0, 2] = cz + own[3] / own[0] * unit
+                weights[c, 0] = own[0]
+                flatness[c, 0] = sqrt(max(low, 0.0)) * unit
+                sign = -1.0 if own[10] * nx + own[11] * ny + own[12] * nz < 0.0 else 1.0
+                if occupied < min_neighbours:
+                    sign = 0.0
+                normals[c, 0, 0], normals[c, 0, 1], normals[c, 0, 2] = sign * nx, sign * ny, sign * nz
+                continue
+            for s in range(2):
+                sign = 1.0 - 2.0 * s
+                side[:] = 0.0
+                pool[:] = 0.0
+                occupied = 0
+                for k in range(27):
+                    if neighbour_cell[k] < 0:
+                        continue
+                    there, other = neighbour_local[k], neighbour_block[k]
+                    seen = False
+                    for slot in range(slot_starts[other], slot_starts[other + 1]):
+                        row = slot_cells[slot, there]
+                        if row >= 0:
+                            m = moments[row]
+                            if (m[10] * nx + m[11] * ny + m[12] * nz) * sign > 0.0:
+                                seen = True
+                                add_moved(
+                                    pool, m, (k // 9 - 1) * units,
+                                    (k // 3 % 3 - 1) * units, (k % 3 - 1) * units,
+                                )  # fmt: skip
+                                if k == 13:
+                                    add_moved(side, m, 0.0, 0.0, 0.0)
+                    occupied += 1 if seen else 0
+                means[c, s, 0] = cx + side[1] / side[0] * unit
+                means[c, s, 1] = cy + side[2] / side[0] * unit
+                means[c, s, 2] = cz + side[3] / side[0] * unit
+                weights[c, s] = side[0]
+                mx, my, mz, low = nx, ny, nz, 0.0
+                if occupied >= min_neighbours:
+                    mx, my, mz, low, _, _ = plane_of(pool)
+                flatness[c, s] = sqrt(max(low, 0.0)) * unit
+                flip = -1.0 if pool[10] * mx + pool[11] * my + pool[12] * mz < 0.0 else 1.0
+                normals[c, s, 0], normals[c, s, 1], normals[c, s, 2] = flip * mx, flip * my, flip * mz

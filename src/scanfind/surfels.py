@@ -1,0 +1,226 @@
+"""The surfel grid: one streaming pass over the raw points answers everything the method asks of a scene.
+
+Each cell keeps moments: n, Σx, Σxxᵀ, Σ direction to the scanner. Their means are the paper's weighted octree (3.1), their
+pooled covariance its normals by PCA (3.2), their bits its support count; moments add, so chunks, files and workers merge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.cloud import SHIFT_BEYOND_M, OrientedCloud, PointChunk
+
+if TYPE_CHECKING:
+    from scanfind.cloud import CloudModel
+    from scanfind.surface import ModelSurface, SurfaceParameters
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+DEPTH_PIXELS = 360  # along an edge of the cube map: 0.25° a pixel, 35 mm at 8 m
+EMPTY_BLOCKS, EMPTY_ROWS = 1024, 1 << 16
+ROWS_AT_ONCE = 64  # what one block may ask for (kernels.grid.sum_children)
+
+
+@dataclass(frozen=True)
+class GridParameters:
+    """How the scene is resampled.
+
+    cell_m : edge of a cell, metres; None: `cells_across` of them along the smallest model's diameter, made larger
+        until the scan fills them
+    cells_across : how many cells the diameter of the smallest model spans; 180 makes 20 mm of a 3.6 m spool
+    least_cells_across : never fewer, however sparse the scan
+    points_per_cell : the median cell must hold so many points, or cells are doubled; fewer make poor normals
+    min_neighbours : occupied cells of the 3×3×3 (itself included) below which a cell has no normal, only presence
+    """
+
+    cell_m: float | None = None
+    cells_across: float = 180.0
+    least_cells_across: float = 40.0
+    points_per_cell: float = 4.0
+    min_neighbours: int = 5
+
+
+class Surfels(NamedTuple):
+    """A scene as oriented points in an addressable grid; V cells, S ≥ V surfels, B blocks of 8×8×8 cells.
+
+    cell : edge, metres
+    offset : (3,) the grid's origin in the scan's frame; everything below is relative to it
+    hash_keys, hash_values : packed block coordinates → block
+    block_keys : (B,) ascending; block_cells : (B, 512) int32, number of each cell, -1 for an empty one
+    first_surfel : (V+1,) the surfels of each cell: one, or two where scanners saw both faces of something thin
+    means : (S, 3) float64; normals : (S, 3) float64, unit, zero where a cell has too few neighbours
+    flatness : (S,) standard deviation across the plane fitted to the 3×3×3, metres
+    points : (S,) raw points in each
+    signed : the normals point to the scanner; False where nobody knows their side
+    """
+
+    cell: float
+    offset: Floats
+    hash_keys: Ints
+    hash_values: NDArray[np.int32]
+    block_keys: Ints
+    block_cells: NDArray[np.int32]
+    first_surfel: NDArray[np.int32]
+    means: Floats
+    normals: Floats
+    flatness: Floats
+    points: Floats
+    signed: bool
+
+    def oriented(self) -> NDArray[np.intp]:
+        """The surfels that have a normal."""
+        return np.flatnonzero((self.normals != 0.0).any(axis=1))
+
+
+class DepthMap(NamedTuple):
+    """The nearest surface seen from one scanner position in each direction.
+
+    origin : (3,) relative to the grid's offset
+    ranges : (6 · edge²,) float32, metres, cube map (see kernels.grid.cube_pixel); inf where no beam came back
+    """
+
+    origin: Floats
+    ranges: NDArray[np.float32]
+    edge: int
+
+
+class MomentGrid:
+    """Raw points in, surfels out. `add` every chunk, in any order; the result does not depend on it.
+
+    cell : edge of a cell, metres; offset : (3,) float64, the grid's origin in the points' frame (`None`: near the first
+    point, rounded to whole metres, so that coordinates keep their digits however far from zero the scan is).
+    """
+
+    def __init__(self, cell: float, offset: Floats | None = None) -> None:
+        self.cell = cell
+        self.offset = offset
+        self.points = 0
+        self.unaddressable = 0
+        self.signed = True
+        self._units = 65536.0
+        self._hash_keys = np.full(4 * EMPTY_BLOCKS, -1, np.int64)
+        self._hash_values = np.zeros(4 * EMPTY_BLOCKS, np.int32)
+        self._block_keys = np.empty(EMPTY_BLOCKS, np.int64)
+        self._block_cells = np.empty((EMPTY_BLOCKS, 512), np.int32)
+        self._moments = np.empty((EMPTY_ROWS, 13), np.int64)
+        self._counts = np.zeros(3, np.int64)
+        self._depths: dict[tuple[float, ...], NDArray[np.float32]] = {}
+
+    def add(self, chunk: PointChunk) -> None:
+        """Sum a chunk's points into the grid and into the depth map of its scanner."""
+        from scanfind.kernels.grid import accumulate
+
+        if not len(chunk):
+            return
+        if self.offset is None:
+            self.offset = np.round(chunk.xyz[0])
+        has_origin = chunk.origin is not None
+        self.signed &= has_origin
+        origin = np.zeros(3) if chunk.origin is None else np.asarray(chunk.origin, np.float64)
+        ranges = np.empty(0, np.float32)
+        if has_origin:
+            key = tuple((origin - self.offset).tolist())
+            ranges = self._depths.setdefault(key, np.full(6 * DEPTH_PIXELS**2, np.inf, np.float32))
+        at = 0
+        while True:
+            at = accumulate(
+                chunk.xyz, at, origin, has_origin, self.offset, self.cell, self._hash_keys, self._hash_values,
+                self._block_keys, self._block_cells, self._moments, self._counts, ranges, DEPTH_PIXELS,
+            )  # fmt: skip
+            if at == len(chunk):
+                break
+            self._make_room()
+        self.points += len(chunk)
+        self.unaddressable = int(self._counts[2])
+
+    def _make_room(self) -> None:
+        """Double whichever array is full. Grown as blocks appear: allocating for the worst case cost more than the pass."""
+        from scanfind.kernels.blocks import fill_hash
+
+        if self._counts[0] + 1 > len(self._block_keys):
+            self._block_keys = np.concatenate([self._block_keys, np.empty_like(self._block_keys)])
+            self._block_cells = np.concatenate([self._block_cells, np.empty_like(self._block_cells)])
+            self._hash_keys = np.full(4 * len(self._block_keys), -1, np.int64)
+            self._hash_values = np.zeros(len(self._hash_keys), np.int32)
+            fill_hash(self._block_keys[: self._counts[0]], self._hash_keys, self._hash_values)
+        if self._counts[1] + ROWS_AT_ONCE > len(self._moments):
+            self._moments = np.concatenate([self._moments, np.empty_like(self._moments)])
+
+    def median_points(self) -> float:
+        """Raw points in the median cell, counting a cell once for each octant it was seen from."""
+        rows = self._moments[: self._counts[1], 0]
+        return float(np.median(rows)) if len(rows) else 0.0
+
+    def coarser(self) -> MomentGrid:
+        """The next level of the octree: cells of twice the edge, each the sum of its eight children."""
+        from scanfind.kernels.grid import sum_children
+
+        parent = MomentGrid(2.0 * self.cell, self.offset)
+        parent.points, parent.unaddressable, parent.signed = self.points, self.unaddressable, self.signed
+        parent._units = 2.0 * self._units
+        parent._depths = self._depths
+        blocks = int(self._counts[0])
+        at = 0
+        while True:
+            at = sum_children(
+                at, self._block_keys[:blocks], self._block_cells, self._moments, np.int64(self._units / 2),
+                parent._hash_keys, parent._hash_values, parent._block_keys, parent._block_cells, parent._moments,
+                parent._counts,
+            )  # fmt: skip
+            if at == blocks:
+                return parent
+            parent._make_room()
+
+    def depth_maps(self) -> list[DepthMap]:
+        """One for each scanner position, in the order of their coordinates."""
+        return [DepthMap(np.array(key), self._depths[key], DEPTH_PIXELS) for key in sorted(self._depths)]
+
+    def surfels(self, min_neighbours: int = 5, jobs: int = 1) -> Surfels:
+        """The mean and the oriented normal of each cell (paper 3.2: PCA over a neighbourhood)."""
+        from scanfind.kernels.blocks import fill_hash
+        from scanfind.kernels.surfels import count_cells, fit_surfels, number_cells
+        from scanfind.threads import in_threads
+
+        used = int(self._counts[0])
+        order = np.argsort(self._block_keys[:used])
+        slots = self._block_keys[:used][order]
+        slot_cells = self._block_cells[:used][order]
+        block_keys, slot_starts = np.unique(slots & ~np.int64(7), return_index=True)
+        slot_starts = np.append(slot_starts, used)
+        hash_keys, hash_values = empty_hash(len(block_keys))
+        fill_hash(block_keys, hash_keys, hash_values)
+
+        first_cell = np.concatenate([[0], np.cumsum(count_cells(slot_starts, slot_cells))])
+        cells = int(first_cell[-1])
+        block_cells = np.empty((len(block_keys), 512), np.int32)
+        cell_locals, totals = np.empty(cells, np.int16), np.empty((cells, 13), np.int64)
+        number_cells(slot_starts, slot_cells, first_cell, self._moments, block_cells, cell_locals, totals)
+
+        sides = np.empty(cells, np.int64)
+        means, normals = np.empty((cells, 2, 3)), np.empty((cells, 2, 3))
+        flatness, points = np.empty((cells, 2)), np.empty((cells, 2))
+        in_threads(
+            jobs, len(block_keys),
+            lambda start, stop: fit_surfels(
+                start, stop, block_keys, hash_keys, hash_values, slot_starts, slot_cells, self._moments, block_cells,
+                first_cell, cell_locals, totals, self.cell, self._units, min_neighbours,
+                sides, means, normals, flatness, points,
+            ),
+        )  # fmt: skip
+        kept = np.arange(2) < sides[:, None]
+        return Surfels(
+            self.cell, np.zeros(3) if self.offset is None else self.offset, hash_keys, hash_values, block_keys,
+            block_cells, np.concatenate([[0], np.cumsum(sides)]).astype(np.int32), means[kept], normals[kept],
+            flatness[kept], points[kept], self.signed,
+        )  # fmt: skip
+
+
+def empty_hash(entries: int) -> tuple[Ints, NDArray[np.int32]]:
+    """Keys and values of an empty hash table with room for so many entries at a load of at most a half."""
+    size = 1 << max(4, int(2 * max(entries, 1) - 1).bit_length())
+    return np.full(size, -1, np.int64), np.zeros(size, np.int32)
