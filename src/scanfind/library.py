@@ -73,15 +73,6 @@ class ModelLibrary:
                 return model
         return self._join_placements(model.sha256, model.placements)
 
-    def put(self, model: Model) -> None:
-        """Keep a model that is prepared already, such as one of another library; no work where it is there.
-
-        Raises LibraryError where another model has the name.
-        """
-        with self._store.transaction(write=True):
-            if not self._is_known(model.sha256, model.name):
-                self._store.insert(Record(model.sha256, model.name, _facts(model)), _arrays(model))
-
     def remove(self, name: str) -> None:
         """Forget a model; raises LibraryError where there is none of that name."""
         with self._store.transaction(write=True):
