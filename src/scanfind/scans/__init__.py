@@ -9,8 +9,8 @@ module and one line in a table, and `tests/test_scans_contract.py` picks it up.
 
 What a reader promises:
 
-- the same points, attributes and source indices whatever `chunk_points` is; no chunk is larger, none is empty save a
-  scan's last one, which may carry only a `dropped` count;
+- the same points, attributes and source indices whatever `chunk_points` is; no chunk is larger, and one is empty only
+  where it has a `dropped` count to report;
 - points whose file calls them invalid, or that are not finite, are dropped and counted, never passed on;
 - every field of the file is an attribute: the names of `KNOWN_ATTRIBUTES` where they fit, else the file's own name;
 - a file that is damaged, cut short or hostile raises UnreadableFileError, one line; it does not crash, hang, or make us
