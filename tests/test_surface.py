@@ -57,10 +57,10 @@ def outside_of_box(surface: ModelSurface, size: tuple[float, ...]) -> Floats:
     normals = surface.samples.normals
     axis = np.abs(normals).argmax(axis=1)
     rows = np.arange(len(axis))
-    assert (np.abs(normals).sum(axis=1) == 1.0).all()
+    np.testing.assert_allclose(np.abs(normals).sum(axis=1), 1.0, atol=1e-14)
     np.testing.assert_allclose(scaled[rows, axis], normals[rows, axis], atol=1e-12)
     assert np.abs(scaled).max() <= 1.0 + 1e-12
-    return np.column_stack([axis, normals[rows, axis]])
+    return np.column_stack([axis, np.sign(normals[rows, axis])])
 
 
 def near_ones(points: Floats, normals: Floats) -> Floats:
