@@ -106,7 +106,7 @@ def cable_tray(length: float) -> Mesh:
     return blocks("cable_tray", parts)
 
 
-def stack(rng: np.random.Generator) -> Mesh:
+def crates(rng: np.random.Generator) -> Mesh:
     """Crates of several sizes on top of each other."""
     parts, low = [], 0.0
     for _ in range(int(rng.integers(1, 4))):

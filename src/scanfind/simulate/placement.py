@@ -10,7 +10,7 @@ from scanfind.mesh import Mesh, doubled_areas
 Floats = NDArray[np.float64]
 
 VOXEL_M = 0.1
-# Nine or so points on each voxel face a surface crosses: few voxels are missed.
+# Nine points or so on each voxel a surface crosses: one in eight thousand is missed.
 POINTS_PER_M2 = 900.0
 
 

@@ -41,6 +41,7 @@ class RayCaster:
         if not placed:
             msg = "a scene to scan needs at least one mesh"
             raise InvalidGeometryError(msg)
+        self.meshes = len(placed)
         triangles = np.concatenate([pose.move(mesh.vertices)[mesh.faces] for mesh, pose in placed])
         normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         self._normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
@@ -64,4 +65,5 @@ class RayCaster:
         toward = points - station
         distance = np.linalg.norm(toward, axis=1)
         hits = self.shoot(station, toward / np.maximum(distance, 1e-9)[:, None])
-        return hits.distance > distance - slack
+        clear: NDArray[np.bool_] = hits.distance > distance - slack
+        return clear

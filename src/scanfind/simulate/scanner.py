@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -15,7 +15,7 @@ from scanfind.cloud import PointCloud, as_points
 from scanfind.errors import UsageError
 from scanfind.pose import Pose
 from scanfind.simulate.rays import RayCaster
-from scanfind.simulate.scenes import BACKGROUND, Scene
+from scanfind.simulate.scene import BACKGROUND, Scene
 
 Floats = NDArray[np.float64]
 
@@ -48,8 +48,8 @@ class Scanner:
     noise: float = 0.002
     noise_per_metre: float = 0.0
     noise_grazing: float = 0.0
-    beam_diameter: float = 0.004
-    beam_divergence: float = 0.0003
+    beam_diameter: float = 0.005
+    beam_divergence: float = 0.0006
     mixing: float = 1.0
     edge: float = 0.03
     dimmest: float = 0.02
@@ -79,8 +79,6 @@ class Scanner:
 
     def with_step(self, step: float) -> Scanner:
         """The same instrument set to another resolution."""
-        from dataclasses import replace
-
         return replace(self, step=step)
 
 
@@ -126,23 +124,32 @@ def scan(
     if not len(where):
         msg = "a scan needs at least one station"
         raise UsageError(msg)
-    caster = RayCaster([(thing.mesh, thing.pose) for thing in scene.objects])
+    caster = scene.caster()
     reflectance = np.array([thing.reflectance for thing in scene.objects])
     device = scanner or Scanner()
     if points is not None:
         device = device.with_step(_step_for(points, caster, reflectance, where, device, seed))
     columns = max(1, BLOCK_RAYS // device.rows())
-    jobs = [(s, c) for s in range(len(where)) for c in range(0, device.columns(), columns)]
-    shoot = partial(_block, caster, reflectance, where, device, seed, columns)
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        blocks = list(pool.map(shoot, jobs))
     clouds = []
-    for s, origin in enumerate(where):
-        mine = [block for (station, _), block in zip(jobs, blocks, strict=True) if station == s]
-        names = mine[0][1].keys()
-        attributes = {name: np.concatenate([a[name] for _, a in mine]) for name in names}
-        clouds.append(PointCloud(np.concatenate([xyz for xyz, _ in mine]), attributes, origin.copy()))
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        for station, origin in enumerate(where):
+            shoot = partial(_block, caster, reflectance, origin, device, (seed, station), columns)
+            blocks = list(pool.map(shoot, range(0, device.columns(), columns)))
+            attributes = {name: np.concatenate([a[name] for _, a in blocks]) for name in blocks[0][1]}
+            clouds.append(PointCloud(np.concatenate([xyz for xyz, _ in blocks]), attributes, origin.copy()))
     return SimulatedScan(clouds, device, scene.truth(), tuple(thing.name for thing in scene.objects))
+
+
+def shares(caster: RayCaster, stations: Floats, scanner: Scanner) -> Floats:
+    """Which share of the beams that meet something each mesh gets, (meshes,), over all stations (S, 3)."""
+    row, column = np.divmod(np.arange(scanner.rows() * scanner.columns()), scanner.columns())
+    directions = scanner.directions(row, column)
+    counts = np.zeros(caster.meshes)
+    for station in stations:
+        owner = caster.shoot(station, directions).owner
+        counts += np.bincount(owner[owner >= 0], minlength=caster.meshes)
+    share: Floats = counts / max(1.0, counts.sum())
+    return share
 
 
 def _step_for(
@@ -155,8 +162,8 @@ def _step_for(
     turn = 2 * np.pi * (scanner.highest - scanner.lowest)
     pilot = scanner.with_step(min(0.5, float(np.sqrt(turn / PILOT_RAYS))))
     back = sum(
-        len(_block(caster, reflectance, stations, pilot, seed, pilot.columns(), (s, 0))[0])
-        for s in range(len(stations))
+        len(_block(caster, reflectance, origin, pilot, (seed, station), pilot.columns(), 0)[0])
+        for station, origin in enumerate(stations)
     )
     share = back / (pilot.rows() * pilot.columns() * len(stations))
     if share == 0.0:
@@ -168,16 +175,15 @@ def _step_for(
 def _block(
     caster: RayCaster,
     reflectance: Floats,
-    stations: Floats,
+    origin: Floats,
     scanner: Scanner,
-    seed: int,
+    seed: tuple[int, int],
     columns: int,
-    job: tuple[int, int],
+    first: int,
 ) -> tuple[Floats, dict[str, NDArray[Any]]]:
-    """Scan `columns` columns from `job` = (station, first column) on: points (N, 3) and their attributes."""
-    station, first = job
-    rng = np.random.default_rng([seed, station, first])
-    origin, rows = stations[station], scanner.rows()
+    """Scan `columns` columns from `first` on: points (N, 3) and their attributes, N at most columns x rows."""
+    rng = np.random.default_rng([*seed, first])
+    rows = scanner.rows()
     column = np.arange(first, min(first + columns, scanner.columns()))
     row = np.tile(np.arange(rows), len(column))
     column = np.repeat(column, rows)

@@ -1,0 +1,63 @@
+"""What there is to scan: objects where they stand, and where the scanner does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.mesh import Mesh
+from scanfind.pose import Pose
+from scanfind.simulate.placement import surface_points
+from scanfind.simulate.rays import RayCaster
+
+Floats = NDArray[np.float64]
+
+# The object id of the room, and of points that lie on nothing.
+BACKGROUND = 0
+
+
+@dataclass(frozen=True, eq=False)
+class SceneObject:
+    """A mesh where it stands: name, scene_from_mesh, diffuse reflectance 0 … 1, and whether it is looked for."""
+
+    name: str
+    mesh: Mesh
+    pose: Pose
+    reflectance: float = 0.5
+    target: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Metres, z up.
+
+    objects : by object id; 0 is the background (the room)
+    stations : (S, 3) where scanners stand
+    """
+
+    objects: tuple[SceneObject, ...]
+    stations: Floats
+
+    def truth(self) -> dict[str, list[Pose]]:
+        """Target name → scene_from_model of each copy."""
+        found: dict[str, list[Pose]] = {}
+        for thing in self.objects:
+            if thing.target:
+                found.setdefault(thing.name, []).append(thing.pose)
+        return found
+
+    def target_ids(self) -> list[int]:
+        """The object ids of what is looked for."""
+        return [k for k, thing in enumerate(self.objects) if thing.target]
+
+    def caster(self) -> RayCaster:
+        """The scene ready to be shot at; owners of hits are object ids."""
+        return RayCaster([(thing.mesh, thing.pose) for thing in self.objects])
+
+    def visible_share(self, object_id: int) -> float:
+        """Which share of an object's surface the stations together see, occlusion by everything counted."""
+        thing, caster = self.objects[object_id], self.caster()
+        points = thing.pose.move(surface_points(thing.mesh, np.random.default_rng(object_id)))
+        return float(np.mean(np.any([caster.sees(station, points) for station in self.stations], axis=0)))
