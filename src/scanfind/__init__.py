@@ -76,11 +76,14 @@ def __getattr__(name: str) -> object:
     if name == "__version__":
         from importlib.metadata import version
 
-        return version("scanfind")
-    if name not in _HOME:
+        value: object = version("scanfind")
+    elif name in _HOME:
+        value = getattr(import_module(f"scanfind.{_HOME[name]}"), name)
+    else:
         msg = f"module 'scanfind' has no attribute {name!r}"
         raise AttributeError(msg)
-    return getattr(import_module(f"scanfind.{_HOME[name]}"), name)
+    globals()[name] = value  # asked once only
+    return value
 
 
 def __dir__() -> list[str]:

@@ -126,10 +126,12 @@ def environment_layers(environ: Mapping[str, str], known: Sequence[str]) -> list
 
 def did_you_mean(word: str, known: Sequence[str]) -> str:
     """A hint for an unknown word: the nearest known one, or all there is where nothing comes near."""
-    tails = {key.rpartition(".")[2]: key for key in known} | {key: key for key in known}
-    near = get_close_matches(word, tails, n=1, cutoff=0.6)
+    # A dotted key is also known by its last part, which is what people remember, and so is its table.
+    names = {key.rpartition(".")[2]: key for key in known}
+    names |= {table: table for table in (key.partition(".")[0] for key in known)} | {key: key for key in known}
+    near = get_close_matches(word, names, n=1, cutoff=0.6)
     if near:
-        return f"did you mean {tails[near[0]]!r}?"
+        return f"did you mean {names[near[0]]!r}?"
     return f"use one of {', '.join(sorted(known))}"
 
 

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import os
 import re
 import shutil
-import sys
 import time
 import unicodedata
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scanfind import schema
+from scanfind.document import document, model_entries
 from scanfind.errors import OutputError, UnreadableFileError
 
 if TYPE_CHECKING:
-    from scanfind.detection import Detection, Findings, IsolatedPoints, Refused
+    from scanfind.detection import Findings, IsolatedPoints
     from scanfind.library import ModelLibrary
     from scanfind.pose import Pose
     from scanfind.progress import Progress
@@ -29,8 +27,6 @@ RESULTS_JSON = "results.json"
 RESULTS_CSV = "results.csv"
 MODELS = "models.scanfind"
 
-# Both ends of a file and its length: a GB is told apart from another in milliseconds, not in seconds.
-FINGERPRINT_BLOCK = 1 << 20
 NAME_BYTES = 120  # of a model's name in a file name; file systems stop at 255
 
 
@@ -49,10 +45,10 @@ def result_folder(out: str | Path, *, overwrite: bool = False) -> Iterator[Path]
         target.parent.mkdir(parents=True, exist_ok=True)
         staged.mkdir()
         yield staged
-        check_free(target, overwrite=overwrite)  # searching takes long enough for somebody else to have come
+        check_free(target, overwrite=overwrite)  # a search takes long enough for somebody else to have come
         _swap(staged, target)
-    except OSError as error:
-        msg = f"{out}: results cannot be written: {error.strerror or error}: choose another folder or make room"
+    except OSError as error:  # scans and models say theirs in words of their own
+        msg = f"{out}: results cannot be written: {error}: choose another folder or make room"
         raise OutputError(msg) from error
     finally:
         shutil.rmtree(staged, ignore_errors=True)
@@ -104,15 +100,17 @@ def fill_folder(
     seed: int = 0,
     format: str = "ply",
     remainder: str | None = None,
+    sought: Sequence[schema.ModelEntry] = (),
     progress: Progress | None = None,
 ) -> schema.Results:
     """Fill a staged result folder with everything found; returns what its results.json holds.
 
     folder : exists and is empty but for `remainder`, see `result_folder`
     models : the library that was searched
-    parameters : of the search, a nested dataclass
+    parameters : of the search, a nested dataclass (or what results.json says of one)
     format : of the isolated clouds: ply, laz, las, e57 or pcd
     remainder : the file in `folder` that holds the rest of the scene, where one was written
+    sought : what was sought, where that is more than `models` has
 
     Raises UnsupportedFormatError for another format, OutputError where the disk says no.
     """
@@ -132,59 +130,16 @@ def fill_folder(
                 progress("write", written, total)
     if findings:
         _write_models(folder / MODELS, models, {found.model for found in findings})
-    results = document(findings, models=models, parameters=parameters, seed=seed, files=files, remainder=remainder)
+    results = document(
+        findings, models=sought or model_entries(models), parameters=parameters, seed=seed, files=files,
+        remainder=remainder,
+    )  # fmt: skip
     _write_csv(folder / RESULTS_CSV, results)
     took = time.perf_counter() - began
     timings = results.timings_s | {"write": took, "total": results.timings_s["total"] + took}
     results = results.model_copy(update={"timings_s": timings})
     (folder / RESULTS_JSON).write_text(results.to_json() + "\n", encoding="utf-8")
     return results
-
-
-def document(
-    findings: Findings,
-    *,
-    models: ModelLibrary,
-    parameters: object,
-    seed: int,
-    files: dict[int, tuple[str, str | None]] | None = None,
-    remainder: str | None = None,
-) -> schema.Results:
-    """The findings as results.json has them.
-
-    files : detection's id → its pose file and point file in the result folder, where there is one
-    """
-    from scanfind import __version__
-
-    files = files or {}
-    stages = ("read", "grid", "search", "verify", "refine", "isolate", "write")
-    timings = dict.fromkeys(stages, 0.0) | findings.timings_s
-    timings["total"] = findings.timings_s.get("total", sum(findings.timings_s.values()))
-    return schema.Results(
-        schema=schema.SCHEMA,
-        scanfind=__version__,
-        seed=seed,
-        parameters=asdict(parameters) if is_dataclass(parameters) and not isinstance(parameters, type) else {},
-        shift_m=findings.shift,
-        crs=findings.crs,
-        scans=[
-            schema.ScanEntry(
-                path=_text(scan.path),
-                points=scan.points,
-                dropped=scan.dropped,
-                stations_m=list(scan.stations),
-                fingerprint=fingerprint(Path(scan.path)),
-            )
-            for scan in findings.scans
-        ],
-        models=_model_entries(models),
-        detections=[_detection_entry(found, *files.get(found.id, (None, None))) for found in findings],
-        refused=[_refused_entry(refused) for refused in findings.refused],
-        remainder=remainder,
-        notes=list(findings.notes),
-        timings_s=timings,
-        peak_memory_bytes=peak_memory_bytes(),
-    )
 
 
 def read_results(folder: str | Path) -> schema.Results:
@@ -205,93 +160,10 @@ def read_results(folder: str | Path) -> schema.Results:
         raise UnreadableFileError(msg) from error
 
 
-def fingerprint(path: Path) -> str | None:
-    """sha256 of a file's length and of its first and last MiB; None where there is no such file.
-
-    It tells an exchanged or edited scan from the one searched, not an adversary's: hashing all of 100 GB takes minutes.
-    """
-    try:
-        with path.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            digest = hashlib.sha256(str(size).encode())
-            digest.update(file.read(FINGERPRINT_BLOCK))
-            file.seek(max(size - FINGERPRINT_BLOCK, 0))
-            digest.update(file.read(FINGERPRINT_BLOCK))
-    except (OSError, ValueError):
-        return None
-    return f"sha256-ends:{digest.hexdigest()}"
-
-
 def safe_name(name: str) -> str:
     """A model's name as part of a file name on any system: letters and digits of any script, `-`, `_`, inner dots."""
     plain = re.sub(r"[^\w.-]+", "_", unicodedata.normalize("NFC", name)).strip("._")
     return plain.encode()[:NAME_BYTES].decode(errors="ignore") or "model"
-
-
-def peak_memory_bytes() -> int:
-    """The most memory this process has held, bytes; 0 where the system does not tell."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return 0
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
-
-
-def _model_entries(models: ModelLibrary) -> list[schema.ModelEntry]:
-    return [
-        schema.ModelEntry(name=model.name, sha256=model.sha256, diameter_m=model.diameter, pairs=model.pairs)
-        for model in models.show()
-    ]
-
-
-def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -> schema.DetectionEntry:
-    deviation = found.deviation
-    return schema.DetectionEntry(
-        id=found.id,
-        model=found.model,
-        scene_from_model=_rows(found.scene_from_model),
-        translation_m=_vector(found.scene_from_model.translation),
-        quaternion=schema.Quaternion(**found.scene_from_model.quaternion()),
-        score=found.score,
-        support=found.support,
-        visible_support=found.visible_support,
-        penalty=found.penalty,
-        coverage=found.coverage,
-        rms_m=found.rms_m,
-        unobservable=[schema.MotionEntry(kind=m.kind, axis=m.axis, through_m=m.through) for m in found.unobservable],
-        points=0 if found.isolated is None else len(found.isolated),
-        isolated=isolated,
-        pose=pose,
-        deviation=None if deviation is None else schema.DeviationEntry(**asdict(deviation)),
-    )
-
-
-def _refused_entry(refused: Refused) -> schema.RefusedEntry:
-    return schema.RefusedEntry(
-        model=refused.model,
-        scene_from_model=_rows(refused.scene_from_model),
-        score=refused.score,
-        support=refused.support,
-        visible_support=refused.visible_support,
-        penalty=refused.penalty,
-        reason=refused.reason,
-    )
-
-
-def _rows(pose: Pose) -> schema.Matrix:
-    a, b, c, d = (tuple(row) for row in pose.matrix().tolist())
-    return a, b, c, d
-
-
-def _vector(values: Iterable[float]) -> schema.Vector:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
-
-
-def _text(path: str) -> str:
-    """A path as JSON can hold it: Linux allows names that are no text at all."""
-    return os.fsencode(path).decode(errors="replace")
 
 
 def _write_models(path: Path, models: ModelLibrary, names: set[str]) -> None:

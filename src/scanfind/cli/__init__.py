@@ -31,11 +31,11 @@ def _version() -> str:
     return __version__
 
 
-app = App(name="scanfind", help=HELP, version=_version, help_formatter="plain", help_format="plaintext")
-app.command(find)
+app = App(name="scanfind", help=HELP, version=_version, help_format="plaintext")
+app.command(find, usage="scanfind find SCAN... (--model FILE... | --library LIB) [OPTIONS]")
 app.command(library)
-app.command(isolate)
-app.command(info)
+app.command(isolate, usage="scanfind isolate RESULT_DIR SCAN... [OPTIONS]")
+app.command(info, usage="scanfind info FILE... [--json]")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
-        return _fail(f"{error}: see scanfind --help", UsageError.exit_code)
+        return _fail(f"{str(error).rstrip('.')}; see scanfind --help", UsageError.exit_code)
     except ScanfindError as error:
         return _fail(error, error.exit_code)
     except KeyboardInterrupt:

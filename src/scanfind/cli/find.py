@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from scanfind.cli.options import Flag, Format, Names, Paths, Position, Units, note, say
+from scanfind.cli.options import Count, Flag, Format, Metres, Names, Paths, Position, Seconds, Units, note, say
 from scanfind.errors import UsageError
 
 if TYPE_CHECKING:
@@ -33,12 +33,12 @@ def find(
     json: Flag = False,
     preset: str | None = None,
     config: Path | None = None,
-    seed: int | None = None,
-    jobs: int | None = None,
-    max_instances: int | None = None,
+    seed: Count | None = None,
+    jobs: Count | None = None,
+    max_instances: Count | None = None,
     min_score: float | None = None,
-    tolerance: float | None = None,
-    time_limit: float | None = None,
+    tolerance: Metres | None = None,
+    time_limit: Seconds | None = None,
     fail_on: Literal["not-found"] | None = None,
 ) -> int:
     """Find every instance of every model in the scans; the files of several scans are one scene.
@@ -102,10 +102,11 @@ def find(
 
     from scanfind.cli.inputs import open_models, open_remainder
     from scanfind.config import load_settings
+    from scanfind.document import document, model_entries
     from scanfind.find import PRESETS
     from scanfind.find import find as find_models
     from scanfind.progress import progress_on
-    from scanfind.results import document, fill_folder, result_folder
+    from scanfind.results import fill_folder, result_folder
 
     flags = {
         "preset": preset, "seed": seed, "jobs": jobs, "units": units, "origin": origin, "format": format,
@@ -123,12 +124,13 @@ def find(
             scans, models, parameters=parameters, seed=run.seed, jobs=run.jobs, origin=run.origin,
             progress=progress, remainder=sink,
         )  # fmt: skip
-        known = {"models": models, "parameters": parameters, "seed": run.seed}
         if folder is None:
-            results = document(findings, **known)
+            results = document(findings, models=model_entries(models), parameters=parameters, seed=run.seed)
         else:
-            left = rest.name if rest else None
-            results = fill_folder(folder, findings, **known, format=run.format, remainder=left, progress=progress)
+            results = fill_folder(
+                folder, findings, models=models, parameters=parameters, seed=run.seed, format=run.format,
+                remainder=rest.name if rest else None, progress=progress,
+            )  # fmt: skip
     report(results, out, json=json)
     missing = {entry.name for entry in results.models} - {found.model for found in results.detections}
     return NOT_FOUND if fail_on == "not-found" and missing else 0

@@ -17,10 +17,10 @@ For example:
     scanfind library add parts.scanfind spool.stl frame.step --units mm
 """
 
-library = App(name="library", help=LIBRARY_HELP)
+library = App(name="library", help=LIBRARY_HELP, usage="scanfind library COMMAND LIB ...")
 
 
-@library.command
+@library.command(usage="scanfind library add LIB MODEL... [OPTIONS]")
 def add(
     lib: Path,
     models: Annotated[list[Path], Parameter(name="MODEL", negative=())],

@@ -9,12 +9,15 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-Flag = Annotated[bool, Parameter(negative=())]
+Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
 Paths = Annotated[list[Path], Parameter(consume_multiple=True, negative=())]
 Names = Annotated[list[str], Parameter(consume_multiple=True, negative=())]
 Units = Literal["mm", "cm", "m", "in", "ft"]
 Format = Literal["ply", "laz", "las", "e57", "pcd"]
-Position = Annotated[str, Parameter(allow_leading_hyphen=True)]
+Position = Annotated[str, Parameter(allow_leading_hyphen=True, metavar="X,Y,Z")]
+Metres = Annotated[float, Parameter(metavar="M")]
+Seconds = Annotated[float, Parameter(metavar="S")]
+Count = Annotated[int, Parameter(metavar="N")]
 
 
 def say(text: str) -> None:

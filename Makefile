@@ -1,0 +1,42 @@
+# make demo   install, find a pump skid in a real scan of a plant room, say where the results lie
+# make test   install, lint, check types and imports, run all tests
+# make fast   the tests that take seconds, in an environment that `make test` made
+
+PYTHON ?= python3.11
+VENV ?= .venv
+BIN := $(VENV)/bin
+DEMO ?= demo
+
+.PHONY: demo test fast lint clean
+
+demo: $(VENV)/installed
+	$(BIN)/scanfind find examples/pump/scan.e57 --model examples/pump/skid.ply --out $(DEMO) --overwrite
+	@echo "demo: poses and points lie in $(abspath $(DEMO)); open $(DEMO)/points/*.ply in CloudCompare"
+
+test: lint
+	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(VENV)/numba-checked $(BIN)/pytest -q tests/test_kernel*.py
+	$(BIN)/pytest -m "slow or not slow"
+
+fast: $(VENV)/developed
+	$(BIN)/pytest
+
+lint: $(VENV)/developed
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+# Installed twice over is harmless: the developer's install holds all of the user's.
+$(VENV)/installed: pyproject.toml | $(BIN)/python
+	$(BIN)/pip install --quiet .
+	touch $@
+
+$(VENV)/developed: pyproject.toml | $(BIN)/python
+	$(BIN)/pip install --quiet --editable '.[dev]'
+	touch $@ $(VENV)/installed
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+clean:
+	rm -rf $(VENV) $(DEMO) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -1,0 +1,205 @@
+"""Findings as results.json has them, and back."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic_core import to_jsonable_python
+
+from scanfind import schema
+from scanfind.detection import Detection, Deviation, Findings, Motion, Refused, SceneScan
+from scanfind.pose import Pose
+
+if TYPE_CHECKING:
+    from scanfind.library import ModelLibrary
+
+STAGES = ("read", "grid", "search", "verify", "refine", "isolate", "write")
+
+# Both ends of a file and its length: a GB is told apart from another in milliseconds, not in seconds.
+FINGERPRINT_BLOCK = 1 << 20
+
+
+def document(
+    findings: Findings,
+    *,
+    models: Sequence[schema.ModelEntry],
+    parameters: object,
+    seed: int,
+    files: dict[int, tuple[str, str | None]] | None = None,
+    remainder: str | None = None,
+) -> schema.Results:
+    """The findings as results.json has them.
+
+    models : what was sought, see `model_entries`
+    files : detection's id → its pose file and point file in the result folder, where there is one
+    """
+    from scanfind import __version__
+
+    files = files or {}
+    timings = dict.fromkeys(STAGES, 0.0) | findings.timings_s
+    timings["total"] = findings.timings_s.get("total", sum(findings.timings_s.values()))
+    return schema.Results(
+        schema=schema.SCHEMA,
+        scanfind=__version__,
+        seed=seed,
+        parameters=to_jsonable_python(parameters),
+        shift_m=findings.shift,
+        crs=findings.crs,
+        scans=[
+            schema.ScanEntry(
+                path=_text(scan.path),
+                points=scan.points,
+                dropped=scan.dropped,
+                stations_m=list(scan.stations),
+                fingerprint=fingerprint(Path(scan.path)),
+            )
+            for scan in findings.scans
+        ],
+        models=list(models),
+        detections=[_detection_entry(found, *files.get(found.id, (None, None))) for found in findings],
+        refused=[_refused_entry(refused) for refused in findings.refused],
+        remainder=remainder,
+        notes=list(findings.notes),
+        timings_s=timings,
+        peak_memory_bytes=peak_memory_bytes(),
+    )
+
+
+def findings_of(results: schema.Results) -> Findings:
+    """What `document` was given, made back from what it gave; all but the points."""
+    findings = Findings([_detection(entry) for entry in results.detections])
+    findings.refused = [_refused(entry) for entry in results.refused]
+    findings.scans = [SceneScan(scan.path, scan.points, scan.dropped, tuple(scan.stations_m)) for scan in results.scans]
+    findings.shift, findings.crs, findings.notes = results.shift_m, results.crs, list(results.notes)
+    findings.timings_s = dict(results.timings_s)
+    return findings
+
+
+def model_entries(models: ModelLibrary) -> list[schema.ModelEntry]:
+    """What a library holds, as results.json has it."""
+    return [
+        schema.ModelEntry(name=model.name, sha256=model.sha256, diameter_m=model.diameter, pairs=model.pairs)
+        for model in models.show()
+    ]
+
+
+def fingerprint(path: Path) -> str | None:
+    """sha256 of a file's length and of its first and last MiB; None where there is no such file.
+
+    It tells an exchanged or edited scan from the one searched, not an adversary's: hashing all of 100 GB takes minutes.
+    """
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            digest = hashlib.sha256(str(size).encode())
+            digest.update(file.read(FINGERPRINT_BLOCK))
+            file.seek(max(size - FINGERPRINT_BLOCK, 0))
+            digest.update(file.read(FINGERPRINT_BLOCK))
+    except (OSError, ValueError):
+        return None
+    return f"sha256-ends:{digest.hexdigest()}"
+
+
+def peak_memory_bytes() -> int:
+    """The most memory this process has held, bytes; 0 where the system does not tell."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -> schema.DetectionEntry:
+    deviation = found.deviation
+    return schema.DetectionEntry(
+        id=found.id,
+        model=found.model,
+        scene_from_model=_rows(found.scene_from_model),
+        translation_m=_vector(found.scene_from_model.translation),
+        quaternion=schema.Quaternion(**found.scene_from_model.quaternion()),
+        score=found.score,
+        support=found.support,
+        visible_support=found.visible_support,
+        penalty=found.penalty,
+        coverage=found.coverage,
+        rms_m=found.rms_m,
+        unobservable=[schema.MotionEntry(kind=m.kind, axis=m.axis, through_m=m.through) for m in found.unobservable],
+        points=0 if found.isolated is None else len(found.isolated),
+        isolated=isolated,
+        pose=pose,
+        deviation=None if deviation is None else schema.DeviationEntry(**asdict(deviation)),
+    )
+
+
+def _refused_entry(refused: Refused) -> schema.RefusedEntry:
+    return schema.RefusedEntry(
+        model=refused.model,
+        scene_from_model=_rows(refused.scene_from_model),
+        score=refused.score,
+        support=refused.support,
+        visible_support=refused.visible_support,
+        penalty=refused.penalty,
+        reason=refused.reason,
+    )
+
+
+def _rows(pose: Pose) -> schema.Matrix:
+    a, b, c, d = (tuple(row) for row in pose.matrix().tolist())
+    return a, b, c, d
+
+
+def _vector(values: Iterable[float]) -> schema.Vector:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _text(path: str) -> str:
+    """A path as JSON can hold it: Linux allows names that are no text at all."""
+    return os.fsencode(path).decode(errors="replace")
+
+
+def _detection(entry: schema.DetectionEntry) -> Detection:
+    deviation = entry.deviation
+    return Detection(
+        id=entry.id,
+        model=entry.model,
+        scene_from_model=_pose(entry.scene_from_model),
+        score=_or_nan(entry.score),
+        support=_or_nan(entry.support),
+        visible_support=_or_nan(entry.visible_support),
+        penalty=_or_nan(entry.penalty),
+        coverage=_or_nan(entry.coverage),
+        rms_m=_or_nan(entry.rms_m),
+        unobservable=tuple(Motion(m.kind, m.axis, m.through_m) for m in entry.unobservable),
+        deviation=None if deviation is None else Deviation(*map(_or_nan, deviation.model_dump().values())),
+    )
+
+
+def _refused(entry: schema.RefusedEntry) -> Refused:
+    return Refused(
+        model=entry.model,
+        scene_from_model=_pose(entry.scene_from_model),
+        score=_or_nan(entry.score),
+        support=_or_nan(entry.support),
+        visible_support=_or_nan(entry.visible_support),
+        penalty=_or_nan(entry.penalty),
+        reason=entry.reason,
+    )
+
+
+def _pose(rows: schema.Matrix) -> Pose:
+    matrix = np.array(rows)
+    Pose.from_matrix(matrix)  # refuses what is no rigid motion; but what it makes orthonormal loses the last digit
+    return Pose(matrix[:3, :3], matrix[:3, 3])
+
+
+def _or_nan(value: float | None) -> float:
+    return float("nan") if value is None else value
