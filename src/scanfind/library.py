@@ -132,7 +132,10 @@ class ModelLibrary:
     def _named(self, name: str) -> Record:
         record = self._store.by_name(name) if _is_text(name) else None
         if record is None:
-            msg = f"no model {name!r} in the library; it has {', '.join(map(repr, self.names())) or 'none'}"
+            there = [repr(record.name) for record in self._store.records()]
+            msg = f"no model {name!r} in the library; it has {', '.join(there[:10]) or 'none'}"
+            if len(there) > 10:
+                msg += f" and {len(there) - 10} more"
             raise LibraryError(msg)
         return record
 
