@@ -1,8 +1,8 @@
 """E57 in (ASTM E2807): several scans a file, each with its pose or none, read in chunks through libE57.
 
-libE57 checks every page against its checksum and every read against its own bounds: 26,000 files with random bytes
+libE57 checks every page against its checksum and every read against its own bounds: 30,000 files with random bytes
 changed and the checksums made right again gave errors, no crash and no hang. So it runs in this process. What it does
-believe is the number of records; that is checked here.
+believe is the number of records, checked here, and the shape of the XML, checked in `e57_xml`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scanfind.cloud import Floats, PointChunk, ScanInfo, Station
 from scanfind.errors import ScanfindError, UnreadableFileError
 from scanfind.pose import Pose
+from scanfind.scans.e57_xml import check_xml
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -164,9 +165,10 @@ def _kept(scan: Scan) -> list[Field]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """The file as libE57 sees it. Its nodes are untyped until touched; one that is not what it should be damns the file."""
+    """The file as libE57 sees it. Its nodes are untyped until touched: one that is not what it should be fails here."""
     from pye57 import libe57
 
+    check_xml(path)
     image = None
     try:
         image = libe57.ImageFile(str(path), "r")
