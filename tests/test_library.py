@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import sqlite3
 import subprocess
@@ -372,14 +373,12 @@ def test_indices_out_of_range_never_reach_a_kernel(change: Callable[[Model], Mod
 # ── all or nothing, and two at once ───────────────────────────────────────────────────────────────────────────────
 
 SCRIPT = """
-import sys, os, signal
+import os, pickle, signal, sys
 from pathlib import Path
-sys.path.insert(0, sys.argv[1])
-from test_library import SMALL, box
 from scanfind.library import ModelLibrary
-path, job, numbers = Path(sys.argv[2]), sys.argv[3], sys.argv[4:]
+from scanfind.store import Store
+path, job, models = Path(sys.argv[1]), sys.argv[2], pickle.load(sys.stdin.buffer)
 if job == "die":
-    from scanfind.store import Store
     insert = Store.insert
     def insert_and_die(store, record, arrays):
         store._connection.execute("PRAGMA cache_size = 1")  # so that half the transaction is in the file already
@@ -390,28 +389,34 @@ if job == "die":
 print("ready", flush=True)
 sys.stdin.readline()
 with ModelLibrary.open(path, create=True) as library:
-    for number in numbers:
-        library.add(box(1, 1, int(number), name=f"box {number}"), SMALL)
+    for model in models:
+        library.put(model)
         if job == "remove":
-            library.remove(f"box {number}")
-    print(library.names(), flush=True)
+            library.remove(model.name)
 """
 
 
-def start(path: Path, job: str, *numbers: int) -> subprocess.Popen[str]:
+def numbered(number: int) -> Model:
+    return build_model(box(1, 1, number, name=f"box {number}"), SMALL)
+
+
+def start(path: Path, job: str, *numbers: int) -> subprocess.Popen[bytes]:
     """Another process, ready to go at a line on its stdin."""
-    command = [sys.executable, "-c", SCRIPT, str(Path(__file__).parent), str(path), job, *map(str, numbers)]
     pipe = subprocess.PIPE
-    process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, str(path), job], stdin=pipe, stdout=pipe, stderr=pipe, bufsize=0
+    )
+    assert process.stdin
     assert process.stdout
-    assert process.stdout.readline() == "ready\n"
+    process.stdin.write(pickle.dumps([numbered(number) for number in numbers]))
+    assert process.stdout.readline() == b"ready\n"
     return process
 
 
 def test_killed_in_the_middle_leaves_the_library_as_before(filled: Path) -> None:
     whole, size = read_all(filled), filled.stat().st_size
     process = start(filled, "die", 7)
-    out, _ = process.communicate("go\n", timeout=60)
+    out, _ = process.communicate(b"go\n", timeout=60)
     assert process.returncode == -signal.SIGKILL
     assert int(out) > size  # it was in the middle
     assert filled.with_name(filled.name + "-journal").exists()
@@ -419,7 +424,7 @@ def test_killed_in_the_middle_leaves_the_library_as_before(filled: Path) -> None
         assert_same(one, two)
     assert filled.stat().st_size == size
     with ModelLibrary.open(filled) as library:
-        library.add(box(1, 1, 7, name="box 7"), SMALL)
+        library.put(numbered(7))
 
 
 def test_two_processes_add_to_one_file(path: Path) -> None:
@@ -427,14 +432,13 @@ def test_two_processes_add_to_one_file(path: Path) -> None:
     both = [start(path, "add", 1, 2, 3, 4), start(path, "add", 3, 4, 5, 6), start(path, "remove", 8, 9)]
     for process in both:
         assert process.stdin
-        process.stdin.write("go\n")
-        process.stdin.flush()
+        process.stdin.write(b"go\n")
     for process in both:
         _, errors = process.communicate(timeout=60)
         assert process.returncode == 0, errors
     with ModelLibrary.open(path) as library:
         assert library.names() == [f"box {n}" for n in range(1, 7)]
-        assert_same(library.get("box 3"), build_model(box(1, 1, 3, name="box 3"), SMALL))
+        assert_same(library.get("box 3"), numbered(3))
 
 
 def test_one_that_never_lets_go_is_waited_for_and_named(filled: Path) -> None:
