@@ -34,6 +34,7 @@ REMEDY = {
     sqlite3.SQLITE_NOTADB: "is not a model library (no SQLite file); name another file",
     sqlite3.SQLITE_CORRUPT: "is damaged; restore it from a copy or build it anew from the model files",
     sqlite3.SQLITE_READONLY: "cannot be written to: the file or its folder is read-only; copy it elsewhere",
+    sqlite3.SQLITE_READONLY_ROLLBACK: "was left half written and is read-only; open it once where it can be written",
     sqlite3.SQLITE_CANTOPEN: "cannot be opened; check the path and the permissions of the file and its folder",
     sqlite3.SQLITE_FULL: "cannot grow: the disk is full; nothing was changed, make room and try again",
     sqlite3.SQLITE_TOOBIG: "cannot take an array of more than 1 GB; use a coarser model",
@@ -53,6 +54,8 @@ class Store:
 
     def __init__(self, connection: sqlite3.Connection, label: str, timeout_s: float) -> None:
         self._connection, self._label, self._timeout_s = connection, label, timeout_s
+        # A text that was damaged into no text is left to its CRC.
+        connection.text_factory = lambda text: text.decode(errors="replace")
 
     @staticmethod
     def open(path: Path, *, create: bool, timeout_s: float) -> Store:
@@ -241,10 +244,11 @@ def _in_words(label: str, timeout_s: float) -> Iterator[None]:
     try:
         yield
     except sqlite3.Error as error:
-        code = getattr(error, "sqlite_errorcode", -1) & 0xFF  # the low byte is the kind, the rest its detail
+        detail = getattr(error, "sqlite_errorcode", -1)
+        code = detail & 0xFF  # the low byte is the kind of error
         if code in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
             what = f"is being written by another process and was not free within {timeout_s:g} s; try again"
         else:
-            what = REMEDY.get(code, f"failed: {error}")
+            what = REMEDY.get(detail) or REMEDY.get(code) or f"failed: {' '.join(str(error).split())}"
         msg = f"{label} {what}"
         raise LibraryError(msg) from error
