@@ -1,7 +1,7 @@
 """Isolate: a second pass over the raw points gives each detection its own, with all their attributes (paper, 3.5).
 
-The paper names this its slow part. Here nearly all points are dismissed by one look-up in the cells near placed surfaces
-(`Vicinity`); the exact distance is left to the few that remain. Points may arrive in any chunks.
+The paper names this its slow part. Here nearly all points are dismissed by one look-up in the cells near placed
+surfaces (`Vicinity`); the exact distance is left to the few that remain. Points may arrive in any chunks.
 """
 
 from __future__ import annotations
@@ -89,7 +89,10 @@ class Isolator:
         self._vicinity, self._start, self._which = vicinity_of(self.placed, parameters)
 
     def cut(self, chunk: PointChunk) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-        """Whose each of N points is, (N,), 0 nobody's, and how far from it, (N,) metres, + outside, NaN for nobody's."""
+        """Whose each of N points is, (N,), 0 for nobody, and its distance to that surface, (N,), NaN for nobody.
+
+        Distances are in metres, + outside.
+        """
         from scanfind.kernels.distance import blocks_of, distances
 
         owner = np.zeros(len(chunk), dtype=np.int32)
@@ -166,15 +169,15 @@ def pieces_of(
     rows = np.flatnonzero(owner)
     rows = rows[np.argsort(owner[rows], kind="stable")]
     mine = subset(chunk, rows)
-    ids, first = np.unique(owner[rows], return_index=True)
-    for key, start, stop in zip(ids.tolist(), first, [*first[1:], len(rows)], strict=True):
-        part = slice(start, stop)
+    ids, first, count = np.unique(owner[rows], return_index=True, return_counts=True)
+    for key, start, n in zip(ids.tolist(), first, count, strict=True):
+        part = slice(start, start + n)
         yield (
             key,
             IsolatedPoints(
                 xyz=mine.xyz[part],
                 attributes={name: values[part] for name, values in mine.attributes.items()},
-                scan_id=np.full(stop - start, chunk.scan, dtype=np.int32),
+                scan_id=np.full(n, chunk.scan, dtype=np.int32),
                 source_index=mine.source_index[part],
                 deviation=deviation[rows[part]],
             ),
@@ -184,9 +187,7 @@ def pieces_of(
 def subset(chunk: PointChunk, rows: NDArray[Any]) -> PointChunk:
     """Some points of a chunk, by mask or row number, with all else it says."""
     attributes = {name: values[rows] for name, values in chunk.attributes.items()}
-    return PointChunk(
-        chunk.xyz[rows], attributes, chunk.source_index[rows], chunk.scan, chunk.origin, chunk.dropped
-    )
+    return PointChunk(chunk.xyz[rows], attributes, chunk.source_index[rows], chunk.scan, chunk.origin, chunk.dropped)
 
 
 def joined(pieces: Sequence[IsolatedPoints], fields: Mapping[str, np.dtype[Any]]) -> IsolatedPoints:
@@ -223,8 +224,8 @@ def vicinity_of(
     shape = (np.floor((high - low) / (8 * cell)) + 1).astype(np.int64)
     found: list[tuple[NDArray[np.int64], NDArray[np.uint64]]] = []
     for p, box in zip(placed, boxes, strict=True):
-        first, stop = np.floor((box - low) / (8 * cell)).astype(np.int64) + [[0], [1]]
-        sides = [np.arange(a, min(b, n)) for a, b, n in zip(first, stop, shape, strict=True)]
+        first, last = np.floor((box - low) / (8 * cell)).astype(np.int64)
+        sides = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
         blocks = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)
         pose = p.scene_from_model
         kept: list[tuple[NDArray[np.int64], NDArray[np.uint64]]] = []

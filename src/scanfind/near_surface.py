@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-# Corners closer than a 2^21st of the model's extent are one (3 m: 1.4 µm): three such coordinates make one int64.
+# Corners are rounded to a 2^21st of the model's extent (3 m: 1.4 µm) to be compared: three such make one int64.
 WELD_STEPS = 2**21 - 1
 # A triangle lower than this share of its length has no normal to speak of (3 m: 30 nm): it is measured as its edges.
 NEEDLE = 1e-8
@@ -154,17 +154,19 @@ def pseudonormals(corners: Floats, normals: Floats) -> NDArray[np.float32]:
     """
     corner = weld(corners)
     edge_from, edge_to = corner, np.roll(corner, -1, axis=1)
-    edge = np.minimum(edge_from, edge_to) * (corner.max() + 1) + np.maximum(edge_from, edge_to)
-    _, edge = np.unique(edge, return_inverse=True)
+    packed = np.minimum(edge_from, edge_to) * (corner.max() + 1) + np.maximum(edge_from, edge_to)
+    edge: NDArray[np.int64] = np.unique(packed, return_inverse=True)[1].reshape(corner.shape)
     ones = np.ones_like(corner, dtype=np.float64)
-    at_edges = summed(edge.reshape(corner.shape), ones, normals)
+    at_edges = summed(edge, ones, normals)
     at_corners = summed(corner, angles(corners), normals)
     return np.concatenate([at_edges, at_corners], axis=1).astype(np.float32)
 
 
 def summed(group: NDArray[np.int64], weight: Floats, normals: Floats) -> Floats:
     """Weighted sum of the normals (F, 3) of all faces in each group; groups, weights and result are (F, 3[, 3])."""
-    total = np.stack([np.bincount(group.ravel(), (weight * normals[:, k, None]).ravel()) for k in range(3)], axis=1)
+    total = np.zeros((group.max() + 1, 3))
+    for k in range(3):
+        total[:, k] = np.bincount(group.ravel(), (weight * normals[:, k, None]).ravel())
     sums: Floats = total[group]
     return sums
 
@@ -175,11 +177,12 @@ def angles(corners: Floats) -> Floats:
     back = np.roll(corners, 1, axis=1) - corners
     # atan2 keeps its digits at the sharp corners of slivers, where arccos has none.
     across: Floats = np.linalg.norm(np.cross(onward, back), axis=2)
-    return np.arctan2(across, (onward * back).sum(axis=2))
+    angle: Floats = np.arctan2(across, (onward * back).sum(axis=2))
+    return angle
 
 
 def weld(corners: Floats) -> NDArray[np.int64]:
-    """A number (F, 3) for each corner, the same where corners coincide."""
+    """A number (F, 3) for each corner, the same where corners are equal, and mostly where they nearly are."""
     low = corners.min(axis=(0, 1))
     extent = float((corners.max(axis=(0, 1)) - low).max()) or 1.0
     steps = np.round((corners - low) * (WELD_STEPS / extent)).astype(np.int64)

@@ -1,13 +1,14 @@
 """Nearest surface: a tree of boxes over triangles or samples, exact distances, and which raw points need one.
 
 Sources: nearest point of a triangle by its Voronoi regions, Ericson, "Real-Time Collision Detection" (2005), 5.1.5;
-sign at edges and corners, Bærentzen & Aanæs, "Signed distance computation using the angle weighted pseudonormal" (2005).
+sign at edges and corners, Bærentzen & Aanæs, "Signed distance computation using the angle weighted
+pseudonormal" (2005).
 """
 
 from __future__ import annotations
 
 from math import sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 LEAF = 4  # primitives a leaf at most
 STACK = 64  # a depth-first descent holds at most one open node a level: enough for 2^64 primitives
+SLACK = 1.0 + 1e-9  # for the rounding of two formulas for one squared distance: a tie must be opened, never lost
 TILE = 256  # points that share one stack: its allocation would cost as much as a query
 
 # The parts of a triangle the nearest point may lie on.
@@ -130,87 +132,84 @@ def box_tree(corners, leaves):
 
 
 @njit(inline="always")
+def outside(low, value, high):
+    """How far a value is outside an interval."""
+    return low - value if value < low else (value - high if value > high else 0.0)
+
+
+@njit(inline="always")
 def to_box(boxes, node, x, y, z):
     """Squared distance to a box; 0 inside."""
-    dx = max(boxes[node, 0] - x, 0.0, x - boxes[node, 3])
-    dy = max(boxes[node, 1] - y, 0.0, y - boxes[node, 4])
-    dz = max(boxes[node, 2] - z, 0.0, z - boxes[node, 5])
+    dx = outside(boxes[node, 0], x, boxes[node, 3])
+    dy = outside(boxes[node, 1], y, boxes[node, 4])
+    dz = outside(boxes[node, 2], z, boxes[node, 5])
     return dx * dx + dy * dy + dz * dz
 
 
 @njit(inline="always")
-def side(a, b, n, x, y, z):
-    """Not negative on the inner side of edge a → b of a triangle with normal n."""
-    ex, ey, ez = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    px, py, pz = x - a[0], y - a[1], z - a[2]
-    return n[0] * (ey * pz - ez * py) + n[1] * (ez * px - ex * pz) + n[2] * (ex * py - ey * px)
-
-
-@njit(inline="always")
-def comes_first(a, b):
-    """Whether point a comes before b by x, then y, then z."""
-    if a[0] != b[0]:
-        return a[0] < b[0]
-    if a[1] != b[1]:
-        return a[1] < b[1]
-    return a[2] < b[2]
+def corner_of(corners, f, k):
+    """Corner k of face f, three scalars."""
+    return corners[f, k, 0], corners[f, k, 1], corners[f, k, 2]
 
 
 @njit(cache=True, nogil=True)
-def from_edge(a, b, x, y, z):
-    """From the nearest point of edge a → b to the point: (dx, dy, dz), and the end it lies on: 1 a, 2 b, 0 between.
+def side(ex, ey, ez, px, py, pz, nx, ny, nz):
+    """Negative where p is on the outer side of edge e of a triangle with normal n, both from the edge's beginning."""
+    return nx * (ey * pz - ez * py) + ny * (ez * px - ex * pz) + nz * (ex * py - ey * px)
+
+
+@njit(cache=True, nogil=True)
+def from_edge(ax, ay, az, bx, by, bz, x, y, z):
+    """From the nearest point of edge a → b to the point: dx, dy, dz, and the end it lies on: 1 a, 2 b, 0 between.
 
     Always measured from the end that comes first, so that the two triangles of an edge get the same bits and tie.
     """
-    if not comes_first(a, b):
-        dx, dy, dz, end = from_first(b, a, x, y, z)
-        return dx, dy, dz, (3 - end) % 3
-    return from_first(a, b, x, y, z)
-
-
-@njit(inline="always")
-def from_first(a, b, x, y, z):
-    """As `from_edge`, measured from a."""
-    ex, ey, ez = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    px, py, pz = x - a[0], y - a[1], z - a[2]
+    swap = bx < ax or (bx == ax and (by < ay or (by == ay and bz < az)))
+    if swap:
+        ax, ay, az, bx, by, bz = bx, by, bz, ax, ay, az
+    ex, ey, ez = bx - ax, by - ay, bz - az
+    px, py, pz = x - ax, y - ay, z - az
     along, whole = ex * px + ey * py + ez * pz, ex * ex + ey * ey + ez * ez
     if along <= 0.0:
-        return px, py, pz, 1
+        return px, py, pz, 2 if swap else 1
     if along >= whole:
-        return x - b[0], y - b[1], z - b[2], 2
+        return x - bx, y - by, z - bz, 1 if swap else 2
     t = along / whole
     return px - t * ex, py - t * ey, pz - t * ez, 0
 
 
 @njit(cache=True, nogil=True)
-def to_triangle(corners, n, x, y, z):
-    """Squared distance to a triangle (3, 3) with unit normal n, and the part the nearest point lies on.
+def to_triangle(corners, normals, f, x, y, z, limit):
+    """Squared distance to a triangle, and the part the nearest point lies on; infinite beyond the squared limit.
 
     Inside or not is asked of the normal, not of barycentric coordinates: those are products of four lengths, and in a
     triangle a millionth as high as long nothing is left of them.
     """
-    a, b, c = corners[0], corners[1], corners[2]
-    needle = n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0
-    outside_ab, outside_bc, outside_ca = needle, needle, needle
-    if not needle:
-        outside_ab = side(a, b, n, x, y, z) < 0.0
-        outside_bc = side(b, c, n, x, y, z) < 0.0
-        outside_ca = side(c, a, n, x, y, z) < 0.0
-        if not (outside_ab or outside_bc or outside_ca):
-            d = n[0] * (x - a[0]) + n[1] * (y - a[1]) + n[2] * (z - a[2])
-            return d * d, FACE
+    ax, ay, az = corner_of(corners, f, 0)
+    nx, ny, nz = normals[f, 0], normals[f, 1], normals[f, 2]
+    plane = nx * (x - ax) + ny * (y - ay) + nz * (z - az)
+    if plane * plane > limit:
+        return np.inf, FACE
+    bx, by, bz = corner_of(corners, f, 1)
+    cx, cy, cz = corner_of(corners, f, 2)
+    needle = nx == 0.0 and ny == 0.0 and nz == 0.0
+    beyond_ab = needle or side(bx - ax, by - ay, bz - az, x - ax, y - ay, z - az, nx, ny, nz) < 0.0
+    beyond_bc = needle or side(cx - bx, cy - by, cz - bz, x - bx, y - by, z - bz, nx, ny, nz) < 0.0
+    beyond_ca = needle or side(ax - cx, ay - cy, az - cz, x - cx, y - cy, z - cz, nx, ny, nz) < 0.0
+    if not (beyond_ab or beyond_bc or beyond_ca):
+        return plane * plane, FACE
     best, part = np.inf, FACE
-    if outside_ab:
-        dx, dy, dz, end = from_edge(a, b, x, y, z)
+    if beyond_ab:
+        dx, dy, dz, end = from_edge(ax, ay, az, bx, by, bz, x, y, z)
         best = dx * dx + dy * dy + dz * dz
         part = EDGE if end == 0 else (CORNER if end == 1 else CORNER + 1)
-    if outside_bc:
-        dx, dy, dz, end = from_edge(b, c, x, y, z)
+    if beyond_bc:
+        dx, dy, dz, end = from_edge(bx, by, bz, cx, cy, cz, x, y, z)
         d2 = dx * dx + dy * dy + dz * dz
         if d2 < best:
             best, part = d2, EDGE + 1 if end == 0 else (CORNER + 1 if end == 1 else CORNER + 2)
-    if outside_ca:
-        dx, dy, dz, end = from_edge(c, a, x, y, z)
+    if beyond_ca:
+        dx, dy, dz, end = from_edge(cx, cy, cz, ax, ay, az, x, y, z)
         d2 = dx * dx + dy * dy + dz * dz
         if d2 < best:
             best, part = d2, EDGE + 2 if end == 0 else (CORNER + 2 if end == 1 else CORNER)
@@ -219,7 +218,7 @@ def to_triangle(corners, n, x, y, z):
 
 @njit(cache=True, nogil=True)
 def nearest(near, x, y, z, limit, enough, nodes, bounds):
-    """The nearest primitive within `limit`: (squared distance, its row or -1, the part); the lowest face where they tie.
+    """The nearest primitive within `limit`: squared distance, row or -1, part; the lowest face of a tie.
 
     enough : the first one of this squared distance or less will do
     nodes, bounds : (STACK,) room for the nodes still to be opened and their squared distances
@@ -230,8 +229,7 @@ def nearest(near, x, y, z, limit, enough, nodes, bounds):
     while waiting > 0:
         waiting -= 1
         node = nodes[waiting]
-        # The slack covers the rounding of two formulas for one distance: a tie must be opened, never lost.
-        if bounds[waiting] > best * (1.0 + 1e-9):
+        if bounds[waiting] > best * SLACK:
             continue
         while node < leaves:
             node, other = 2 * node, 2 * node + 1
@@ -239,20 +237,20 @@ def nearest(near, x, y, z, limit, enough, nodes, bounds):
             if other_bound < bound:
                 node, other = other, node
                 bound, other_bound = other_bound, bound
-            if other_bound <= best * (1.0 + 1e-9):
+            if other_bound <= best * SLACK:
                 nodes[waiting], bounds[waiting] = other, other_bound
                 waiting += 1
-            if bound > best * (1.0 + 1e-9):
+            if bound > best * SLACK:
                 break
         if node < leaves:
             continue
         j = node - leaves
         for f in range(n * j // leaves, n * (j + 1) // leaves):
             if near.spacing > 0.0:
-                p = near.corners[f, 0]
-                d2, where = (x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2, FACE
+                px, py, pz = corner_of(near.corners, f, 0)
+                d2, where = (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2, FACE
             else:
-                d2, where = to_triangle(near.corners[f], near.normals[f], x, y, z)
+                d2, where = to_triangle(near.corners, near.normals, f, x, y, z, best * SLACK)
             if d2 < best or (d2 == best and (row < 0 or near.face[f] < near.face[row])):
                 best, row, part = d2, f, where
         if row >= 0 and best <= enough:
@@ -263,8 +261,8 @@ def nearest(near, x, y, z, limit, enough, nodes, bounds):
 @njit(cache=True, nogil=True)
 def signed_distance(near, row, part, squared, x, y, z):
     """Distance of a point to the primitive `nearest` found, + outside; NaN where it is out of reach after all."""
-    a, n = near.corners[row, 0], near.normals[row]
-    plane = n[0] * (x - a[0]) + n[1] * (y - a[1]) + n[2] * (z - a[2])
+    ax, ay, az = corner_of(near.corners, row, 0)
+    plane = near.normals[row, 0] * (x - ax) + near.normals[row, 1] * (y - ay) + near.normals[row, 2] * (z - az)
     if near.spacing > 0.0:
         # A sample stands for a small disk: beyond its rim there is no surface to measure.
         if squared - plane * plane > near.spacing * near.spacing or abs(plane) > near.reach:
@@ -275,38 +273,16 @@ def signed_distance(near, row, part, squared, x, y, z):
         return distance
     if part == FACE:
         return plane
-    m = near.pseudonormals[row, part - EDGE]
+    k = (part - EDGE) % 3
+    ax, ay, az = corner_of(near.corners, row, k)
     if part >= CORNER:
-        p = near.corners[row, part - CORNER]
-        dx, dy, dz = x - p[0], y - p[1], z - p[2]
+        dx, dy, dz = x - ax, y - ay, z - az
     else:
-        p, q = near.corners[row, part - EDGE], near.corners[row, (part - EDGE + 1) % 3]
-        dx, dy, dz, _ = from_edge(p, q, x, y, z)
-    return distance if m[0] * dx + m[1] * dy + m[2] * dz >= 0.0 else -distance
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def distances(near, rotation, translation, shift, xyz, rows):
-    """Signed distances (K,) float32 of the points xyz[rows], NaN beyond reach, and the nearest faces (K,), -1 there.
-
-    rotation, translation : (3, 3), (3,) scene_from_model, where the scene is xyz - shift
-    """
-    k = len(rows)
-    distance, face = np.empty(k, np.float32), np.empty(k, np.int32)
-    limit = sqrt(near.reach**2 + near.spacing**2)
-    for tile in prange((k + TILE - 1) // TILE):
-        nodes, bounds = np.empty(STACK, np.int64), np.empty(STACK)
-        for i in range(tile * TILE, min(k, (tile + 1) * TILE)):
-            # In double precision, far coordinates first: at 5,000 km from the origin a digit is a nanometre.
-            p = xyz[rows[i]]
-            x, y, z = to_model(rotation, translation, p[0] - shift[0], p[1] - shift[1], p[2] - shift[2])
-            squared, row, part = nearest(near, x, y, z, limit, -1.0, nodes, bounds)
-            distance[i], face[i] = np.nan, -1
-            if row >= 0:
-                d = signed_distance(near, row, part, squared, x, y, z)
-                if d == d:  # not NaN
-                    distance[i], face[i] = d, near.face[row]
-    return distance, face
+        bx, by, bz = corner_of(near.corners, row, (k + 1) % 3)
+        dx, dy, dz, _ = from_edge(ax, ay, az, bx, by, bz, x, y, z)
+    m = near.pseudonormals
+    cosine = m[row, part - EDGE, 0] * dx + m[row, part - EDGE, 1] * dy + m[row, part - EDGE, 2] * dz
+    return distance if cosine >= 0.0 else -distance
 
 
 @njit(cache=True, nogil=True)
@@ -317,6 +293,36 @@ def to_model(rotation, translation, u, v, w):
     y = rotation[0, 1] * u + rotation[1, 1] * v + rotation[2, 1] * w
     z = rotation[0, 2] * u + rotation[1, 2] * v + rotation[2, 2] * w
     return x, y, z
+
+
+@njit(cache=True, nogil=True)
+def measure(near, rotation, translation, shift, xyz, rows, distance, face):
+    """Fill in distance and face of some of the rows, see `distances`."""
+    nodes, bounds = np.empty(STACK, np.int64), np.empty(STACK)
+    limit = sqrt(near.reach**2 + near.spacing**2)
+    for i in range(len(rows)):
+        # In double precision, far coordinates first: at 5,000 km from the origin a digit is a nanometre.
+        u, v, w = xyz[rows[i], 0] - shift[0], xyz[rows[i], 1] - shift[1], xyz[rows[i], 2] - shift[2]
+        x, y, z = to_model(rotation, translation, u, v, w)
+        squared, row, part = nearest(near, x, y, z, limit, -1.0, nodes, bounds)
+        distance[i], face[i] = np.nan, -1
+        if row >= 0:
+            distance[i] = signed_distance(near, row, part, squared, x, y, z)
+            if not np.isnan(distance[i]):
+                face[i] = near.face[row]
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def distances(near, rotation, translation, shift, xyz, rows):
+    """Signed distances (K,) float32 of the points xyz[rows], NaN beyond reach, and the nearest faces (K,), -1 there.
+
+    rotation, translation : (3, 3), (3,) scene_from_model, where the scene is xyz - shift
+    """
+    distance, face = np.empty(len(rows), np.float32), np.empty(len(rows), np.int32)
+    for tile in prange((len(rows) + TILE - 1) // TILE):
+        part = slice(tile * TILE, (tile + 1) * TILE)
+        measure(near, rotation, translation, shift, xyz, rows[part], distance[part], face[part])
+    return distance, face
 
 
 @njit(cache=True, nogil=True)
