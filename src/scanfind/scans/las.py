@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanfind.cloud import PointChunk, ScanInfo, Station
 from scanfind.errors import UnreadableFileError
-from scanfind.scans.las_header import LasHeader, read_header
+from scanfind.scans.las_header import EXACT, LasHeader, read_header
 from scanfind.scans.laz import decompressed
 
 # A chunk of records takes no more than this, even where each is 64 KiB long.
@@ -105,6 +105,9 @@ def _attributes(records: NDArray[Any], header: LasHeader) -> Mapping[str, NDArra
                 with np.errstate(over="ignore", invalid="ignore"):
                     values = values * (dimension.scale[part] if dimension.scale else 1.0)
                     values += dimension.offset[part] if dimension.offset else 0.0
+            if name.endswith(EXACT) and name.removesuffix(EXACT) in columns:
+                name = name.removesuffix(EXACT)
+                del columns[name]
             columns[_unused(name, columns)] = values
     return columns
 

@@ -23,6 +23,8 @@ HEADER_BYTES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
 FORMAT_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
 EXTRA_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 EXTRA_BYTES, LASZIP, WKT, GEO_KEYS = 4, 22204, 2112, 34735
+# Our writer's ending for the extra dimension that holds exactly what a dimension of the point format could not.
+EXACT = "_exact"
 PROJECTED_CRS, GEOGRAPHIC_CRS, USER_DEFINED = 3072, 2048, 32767
 
 
