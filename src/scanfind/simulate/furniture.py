@@ -1,4 +1,4 @@
-"""What stands about in a shop: room, columns, tables, racks, saw horses, drums, stairs, cable trays."""
+"""What stands about in a shop: walls, columns, tables, racks, saw horses, drums, stairs, crates, cable trays."""
 
 from __future__ import annotations
 
@@ -11,19 +11,26 @@ from scanfind.simulate.parts import assemble, blocks, i_section, pipe, revolve
 WALL_M = 0.2
 
 
-def room(x: float, y: float, z: float, office: tuple[float, float] = (3.0, 2.6)) -> Mesh:
-    """Walls, floor and ceiling around (0, 0, 0) … (x, y, z), with an office of `office` metres in the far corner."""
-    w, (u, v) = WALL_M, office
+def hall(x: float, y: float, z: float) -> Mesh:
+    """Outer walls, floor and ceiling around (0, 0, 0) … (x, y, z)."""
+    w = WALL_M
     slabs = [((-w, -w, -w), (x + w, y + w, 0.0)), ((-w, -w, z), (x + w, y + w, z + w))]
     slabs += [((-w, -w, 0.0), (0.0, y + w, z)), ((x, -w, 0.0), (x + w, y + w, z))]
     slabs += [((0.0, -w, 0.0), (x, 0.0, z)), ((0.0, y, 0.0), (x, y + w, z))]
-    # Office walls with a door 0.9 m wide in the one and a window in the other.
-    left, front = x - u, y - v
-    slabs += [((left, front, 0.0), (left + 0.1, front + 0.6, z)), ((left, front + 1.5, 0.0), (left + 0.1, y, z))]
-    slabs += [((left, front + 0.6, 2.1), (left + 0.1, front + 1.5, z))]
-    slabs += [((left, front, 0.0), (x, front + 0.1, 1.0)), ((left, front, 2.0), (x, front + 0.1, z))]
-    slabs += [((left, front, 1.0), (left + 0.7, front + 0.1, 2.0)), ((x - 0.7, front, 1.0), (x, front + 0.1, 2.0))]
-    return blocks("room", slabs)
+    return blocks("hall", slabs)
+
+
+def office(x: float, y: float, z: float) -> Mesh:
+    """Two inner walls that make a room of x by y in the corner at the origin's far side: a door and a window.
+
+    It lies at -x … 0, -y … 0; the door, 0.9 m wide, is in the wall along y, the window in the one along x.
+    """
+    w, sill, lintel, door = 0.1, 1.0, 2.0, 2.1
+    walls = [((-x, -y, 0.0), (-x + w, 0.6 - y, z)), ((-x, 1.5 - y, 0.0), (-x + w, 0.0, z))]
+    walls += [((-x, 0.6 - y, door), (-x + w, 1.5 - y, z))]
+    walls += [((-x, -y, 0.0), (0.0, w - y, sill)), ((-x, -y, lintel), (0.0, w - y, z))]
+    walls += [((-x, -y, sill), (0.7 - x, w - y, lintel)), ((-0.7, -y, sill), (0.0, w - y, lintel))]
+    return blocks("office", walls)
 
 
 def column(height: float) -> Mesh:

@@ -11,13 +11,14 @@ from scanfind.mesh import Mesh
 from scanfind.pose import Pose
 from scanfind.simulate import furniture
 from scanfind.simulate.objects import other_spool
-from scanfind.simulate.parts import blocks
+from scanfind.simulate.parts import assemble, blocks
 from scanfind.simulate.placement import Occupancy, surface_points
 from scanfind.simulate.scene import SceneObject
 
 Floats = NDArray[np.float64]
 
 SHOP_M = (12.0, 10.0, 4.2)
+OFFICE_M = (3.0, 2.6)
 COLUMNS_M = ((0.2, 3.3), (0.2, 6.7), (11.8, 3.3), (4.0, 9.8), (8.0, 0.2))
 TRAYS_M = (2.5, 6.0)
 WALL_GAP_M = 0.1
@@ -37,18 +38,20 @@ class Layout:
         purposes = ("target", "furniture", "spools", "stations", "paint")
         self.rngs = {purpose: np.random.default_rng([*seed, k]) for k, purpose in enumerate(purposes)}
         self.room = Occupancy(SHOP_M)
-        self.objects: list[SceneObject] = []
-        shell = SceneObject("room", furniture.room(*SHOP_M), Pose.identity(), 0.6)
-        self.objects.append(shell)
-        # Only the office takes room: the outer walls, floor and ceiling are where the room ends.
-        walls = self.on_surface(shell)
-        self.room.take(walls[((walls > 0.02) & (walls < np.array(SHOP_M) - 0.02)).all(axis=1)])
+        self._spread: dict[Mesh, Floats] = {}
+        office = (furniture.office(*OFFICE_M, SHOP_M[2]), _at(*SHOP_M[:2]))
+        # Of the background only the office takes room: hall and occupancy end at the same planes.
+        self.room.take(self.on_surface(SceneObject("office", *office)))
+        background = assemble("room", [(furniture.hall(*SHOP_M), Pose.identity()), office])
+        self.objects = [SceneObject("room", background, Pose.identity(), 0.6)]
         for x, y in COLUMNS_M:
             self.put([self._object("column", furniture.column(SHOP_M[2]), _at(x, y))])
 
     def on_surface(self, thing: SceneObject) -> Floats:
         """Points (N, 3) spread over an object where it stands."""
-        return thing.pose.move(surface_points(thing.mesh, np.random.default_rng(0)))
+        if thing.mesh not in self._spread:
+            self._spread[thing.mesh] = surface_points(thing.mesh, np.random.default_rng(0))
+        return thing.pose.move(self._spread[thing.mesh])
 
     def put(self, things: Sequence[SceneObject]) -> bool:
         """Put things where they are meant to be, all or none: not where anything is already."""

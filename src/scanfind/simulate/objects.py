@@ -145,7 +145,8 @@ def other_spool(rng: np.random.Generator, unlike: SpoolDesign | None = None, nam
 def box_frame() -> Mesh:
     """The paper's BF: a 3.5 x 2 x 2 m frame of square hollow sections, nearly but not exactly symmetric.
 
-    Twelve edges; one cross member at mid-height of the end at x = 0; one brace on the side at y = 0.
+    Twelve edges; one cross member at mid-height of the end at x = 0; one brace on the side at y = 0,
+    from the post at x = 0 up to the top member.
     """
     (x, y, z), m = FRAME_SIZE_M, FRAME_MEMBER_M
     members = [((0.0, v, w), (x, v + m, w + m)) for v in (0.0, y - m) for w in (0.0, z - m)]
@@ -153,14 +154,15 @@ def box_frame() -> Mesh:
     members += [((u, v, 0.0), (u + m, v + m, z)) for u in (0.0, x - m) for v in (0.0, y - m)]
     members.append(((0.0, 0.0, z / 2 - m / 2), (m, y, z / 2 + m / 2)))
 
-    near, far = m / 10, m - m / 10
-    foot, head = (0.25, 0.35), (z - 0.35, z - 0.25)
-    holes = [((u, near, low), (u, far, high)) for u, (low, high) in ((m, foot), (x - m, head))]
-    corners = [(u, v, w) for u, ends in ((m, foot), (x - m, head)) for w in ends for v in (near, far)]
-    # Corners: foot low near, low far, high near, high far, then the head's; the four long sides of a sheared prism.
-    sides = [(0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = np.array([three for a, b, c, d in sides for three in ((a, c, b), (a, d, c))])
-    brace = Mesh.of("brace", corners, faces)
+    # The brace, 80 mm square, rises 3 in 4 from the post's inner face to the top member's underside. Where it lands,
+    # the members' faces are left out. Its corners: on the post low and high, on the member far and near.
+    near, far, foot, slope = m / 10, m - m / 10, (0.25, 0.35), 0.75
+    head = [m + (z - m - low) / slope for low in foot]
+    holes = [((m, near, foot[0]), (m, far, foot[1])), ((head[1], near, z - m), (head[0], far, z - m))]
+    profile = [(m, foot[0]), (m, foot[1]), (head[0], z - m), (head[1], z - m)]
+    corners = [(u, v, w) for u, w in profile for v in (near, far)]
+    sides = [(0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+    brace = Mesh.of("brace", corners, [three for a, b, c, d in sides for three in ((a, b, c), (a, c, d))])
     here = Pose.identity()
     return assemble("box_frame", [(blocks("edges", members, holes), here), (brace, here)])
 

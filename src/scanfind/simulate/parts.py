@@ -27,11 +27,13 @@ WELD_M = 1e-6
 
 def pipe(radius: float, length: float) -> Mesh:
     """A pipe's outside without its ends: radius, length along +z."""
+    _check_positive(radius=radius, length=length)
     return revolve("pipe", [(radius, 0.0), (radius, length)])
 
 
 def cylinder(radius: float, length: float) -> Mesh:
     """A closed cylinder along +z."""
+    _check_positive(radius=radius, length=length)
     return revolve("cylinder", [(0.0, 0.0), (radius, 0.0), (radius, length), (0.0, length)])
 
 
