@@ -330,14 +330,17 @@ def test_a_file_cut_short_is_noticed(filled: Path) -> None:
         assert_noticed_or_harmless(filled, content[:end], whole)
 
 
-def test_a_changed_byte_is_noticed(filled: Path) -> None:
-    """Wherever it is: in the header, a page's own tables, a name or an array."""
+def test_changed_bytes_are_noticed(filled: Path) -> None:
+    """Wherever they are: in the header, the schema, a page's own tables, a name or an array."""
     whole, content = read_all(filled), filled.read_bytes()
     rng = np.random.default_rng(0)
-    places = [*range(0, 110, 3), *rng.integers(0, len(content), 150).tolist()]
-    for place in places:
+    for place in [*range(0, 110, 3), *rng.integers(0, len(content), 150).tolist()]:
         changed = bytearray(content)
         changed[place] ^= 1 << int(rng.integers(8))
+        assert_noticed_or_harmless(filled, bytes(changed), whole)
+    for place in [*rng.integers(100, 4096, 50).tolist(), *rng.integers(0, len(content), 50).tolist()]:
+        changed = bytearray(content)
+        changed[place : place + 64] = rng.bytes(64)
         assert_noticed_or_harmless(filled, bytes(changed), whole)
 
 

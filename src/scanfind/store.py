@@ -243,6 +243,9 @@ def _in_words(label: str, timeout_s: float) -> Iterator[None]:
     """Turn what SQLite says into one line: what, why, what to do."""
     try:
         yield
+    except UnicodeDecodeError as error:  # SQLite quotes a damaged schema in a message that Python cannot read
+        msg = f"{label} {REMEDY[sqlite3.SQLITE_CORRUPT]}"
+        raise LibraryError(msg) from error
     except sqlite3.Error as error:
         detail = getattr(error, "sqlite_errorcode", -1)
         code = detail & 0xFF  # the low byte is the kind of error
