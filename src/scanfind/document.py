@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -125,17 +126,19 @@ def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -
         scene_from_model=_rows(found.scene_from_model),
         translation_m=_vector(found.scene_from_model.translation),
         quaternion=schema.Quaternion(**found.scene_from_model.quaternion()),
-        score=found.score,
-        support=found.support,
-        visible_support=found.visible_support,
-        penalty=found.penalty,
-        coverage=found.coverage,
-        rms_m=found.rms_m,
+        score=_or_none(found.score),
+        support=_or_none(found.support),
+        visible_support=_or_none(found.visible_support),
+        penalty=_or_none(found.penalty),
+        coverage=_or_none(found.coverage),
+        rms_m=_or_none(found.rms_m),
         unobservable=[schema.MotionEntry(kind=m.kind, axis=m.axis, through_m=m.through) for m in found.unobservable],
         points=0 if found.isolated is None else len(found.isolated),
         isolated=isolated,
         pose=pose,
-        deviation=None if deviation is None else schema.DeviationEntry(**asdict(deviation)),
+        deviation=None
+        if deviation is None
+        else schema.DeviationEntry(**{key: _or_none(value) for key, value in asdict(deviation).items()}),
     )
 
 
@@ -143,10 +146,10 @@ def _refused_entry(refused: Refused) -> schema.RefusedEntry:
     return schema.RefusedEntry(
         model=refused.model,
         scene_from_model=_rows(refused.scene_from_model),
-        score=refused.score,
-        support=refused.support,
-        visible_support=refused.visible_support,
-        penalty=refused.penalty,
+        score=_or_none(refused.score),
+        support=_or_none(refused.support),
+        visible_support=_or_none(refused.visible_support),
+        penalty=_or_none(refused.penalty),
         reason=refused.reason,
     )
 
@@ -201,5 +204,9 @@ def _pose(rows: schema.Matrix) -> Pose:
     return Pose(matrix[:3, :3], matrix[:3, 3])
 
 
+def _or_none(value: float) -> float | None:
+    return float(value) if isfinite(value) else None
+
+
 def _or_nan(value: float | None) -> float:
-    return float("nan") if value is None else value
+    return nan if value is None else value

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from scanfind.cli.options import Flag, say
+from scanfind.cli.options import Flag, note, say
+from scanfind.errors import ScanfindError
 
 if TYPE_CHECKING:
     from scanfind.cloud import ScanInfo
 
+HEADER_BYTES = 1 << 16
 
-def info(files: Annotated[list[Path], Parameter(name="FILE", negative=())], /, *, json: Flag = False) -> None:
+
+def info(files: Annotated[list[Path], Parameter(name="FILE", negative=())], /, *, json: Flag = False) -> int:
     """Say what is in scan or model files, without reading their points.
 
     For example:
@@ -28,35 +32,53 @@ def info(files: Annotated[list[Path], Parameter(name="FILE", negative=())], /, *
         Print JSON instead of lines.
 
     """
-    told = [_told(file) for file in files]
+    told, code = [], 0
+    for file in files:
+        try:
+            told.append(_told(file))
+        except ScanfindError as error:  # one bad file does not keep the others from being told
+            note(str(error))
+            code = error.exit_code
     if json:
         from json import dumps
 
         say(dumps(told, indent=2, ensure_ascii=False))
-        return
-    say("\n\n".join(_lines(facts) for facts in told))
+    elif told:
+        say("\n\n".join(_lines(facts) for facts in told))
+    return code
 
 
 def _told(file: Path) -> dict[str, Any]:
     """A file's facts, plain enough for JSON."""
-    from scanfind.models import MODEL_READERS, model_info
+    from dataclasses import asdict
+
+    from scanfind.models import model_info
     from scanfind.scans import SCAN_READERS, scan_info
 
-    suffix = file.suffix.lower()
-    # A PLY is a model if it has faces, else a scan.
-    if suffix in MODEL_READERS and not (suffix in SCAN_READERS and scan_info(file).points):
-        return model_info(file)
-    return _scan_facts(scan_info(file))
+    if file.suffix.lower() in SCAN_READERS and not _has_faces(file):
+        return _scan_facts(scan_info(file))
+    return asdict(model_info(file))
+
+
+def _has_faces(file: Path) -> bool:
+    """Whether the header of a PLY announces faces: then it is a model, else a scan."""
+    if file.suffix.lower() != ".ply" or not file.is_file():
+        return False
+    with file.open("rb") as ply:
+        header = ply.read(HEADER_BYTES).partition(b"end_header")[0]
+    return re.search(rb"^element\s+face\s+0*[1-9]", header, re.MULTILINE) is not None
 
 
 def _scan_facts(about: ScanInfo) -> dict[str, Any]:
+    import numpy as np
+
     return {
         "path": about.path,
         "format": about.format,
         "points": about.points,
         "bounds_m": about.bounds,
         "crs": about.crs,
-        "attributes": dict(about.attributes),
+        "attributes": {name: np.dtype(kind).name for name, kind in about.attributes.items()},
         "scans": [{"name": s.name, "points": s.points, "origin_m": s.origin} for s in about.stations],
     }
 
@@ -67,7 +89,7 @@ def _lines(facts: dict[str, Any]) -> str:
     for key, value in facts.items():
         if isinstance(value, dict):
             lines.append(f"{key:<11}" + (", ".join(f"{name} {kind}" for name, kind in value.items()) or "–"))
-        elif isinstance(value, list):
+        elif key in ("scans", "models"):
             lines.append(f"{key:<11}{len(value)}")
             lines += ["  " + ", ".join(f"{k} {_cell(v)}" for k, v in part.items()) for part in value]
         else:
@@ -79,5 +101,9 @@ def _cell(value: object) -> str:
     if value is None or value == -1:
         return "unknown"
     if isinstance(value, tuple):
-        return " … ".join(map(_cell, value)) if isinstance(value[0], tuple) else " ".join(f"{v:.3f}" for v in value)
+        return (" … " if value and isinstance(value[0], tuple) else " ").join(map(_cell, value)) or "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.3f}"
     return f"{value:,}" if isinstance(value, int) else str(value)

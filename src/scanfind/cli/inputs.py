@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from scanfind.cli.options import note
+
 if TYPE_CHECKING:
     from scanfind.config import Run
     from scanfind.find import Parameters
@@ -28,15 +30,20 @@ def open_models(
 
 def add_models(models: ModelLibrary, files: Sequence[Path], run: Run, parameters: Parameters) -> list[str]:
     """Prepare every model of the files and keep it in the library; their names."""
-    from scanfind.library import ModelParameters
-    from scanfind.models import read_models
+    from scanfind.mesh import Mesh
+    from scanfind.model import ModelParameters
+    from scanfind.models import STATES_UNITS, read_models
 
     prepared = ModelParameters(surface=parameters.surface, pairs=parameters.pairs)
-    return [
-        models.add(model, prepared).name
-        for file in files
-        for model in read_models(file, units=run.units, select=run.select)
-    ]
+    names = []
+    for file in files:
+        # One --units may stand for a mixed list of files, of which some say theirs.
+        units = None if file.suffix.lower() in STATES_UNITS else run.units
+        for model in read_models(file, units=units, select=run.select):
+            if isinstance(model, Mesh) and "hint" in model.notes:
+                note(f"{model.name}: {model.notes['hint']}")
+            names.append(models.add(model, prepared).name)
+    return names
 
 
 def open_remainder(path: Path, scans: Sequence[Path]) -> CloudWriter:
