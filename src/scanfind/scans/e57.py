@@ -37,6 +37,9 @@ NAMES: Mapping[str, str] = {
     "normalZ": "normal_z",
 }
 NORMALS = ("normal_x", "normal_y", "normal_z")
+# pye57 0.4.19 refuses numpy's int32 and fills only every other half of its int64 where that is a C long (Linux, macOS):
+# all wide integers pass through C's long long, the same 64 bits by a name it understands.
+WIDE = np.dtype(np.longlong)
 # Our own extension: the fields E57 has no name for, and the mark of a cloud whose pose is a shift, not a station.
 EXTENSION, EXTENSION_URI = "scanfind", "https://scanfind.org/e57/1.0"
 MERGED = f"{EXTENSION}:merged"
@@ -56,6 +59,12 @@ class Field(NamedTuple):
     dtype: np.dtype[Any]
     bits: int
     plus: int = 0
+
+    @property
+    def memory(self) -> np.dtype[Any]:
+        """The dtype pye57 fills."""
+        direct = self.dtype.kind == "f" or (self.dtype.itemsize <= 2 and not self.plus)
+        return self.dtype if direct else WIDE
 
 
 class Scan(NamedTuple):
@@ -109,9 +118,9 @@ def _columns(image: Any, scan: Scan, chunk_points: int, path: Path) -> Iterator[
 
     if not scan.records:
         return
-    capacity = min(chunk_points, scan.records, max(1, BLOCK_BYTES // sum(f.dtype.itemsize for f in scan.fields)))
+    capacity = min(chunk_points, scan.records, max(1, BLOCK_BYTES // sum(f.memory.itemsize for f in scan.fields)))
     buffers = libe57.VectorSourceDestBuffer()
-    columns = {field.element: np.empty(capacity, field.dtype) for field in scan.fields}
+    columns = {field.element: np.empty(capacity, field.memory) for field in scan.fields}
     for element, column in columns.items():
         buffers.append(libe57.SourceDestBuffer(image, element, column, capacity, True, True))
     reader = scan.points.reader(buffers)
@@ -144,9 +153,10 @@ def _chunk(scan: Scan, number: int, first: int, columns: Mapping[str, NDArray[An
     if (state := columns.get(_state(scan))) is not None:
         # 1: only the direction is meaningful; 2: nothing is.
         valid &= state == 0
-    attributes = {f.name: columns[f.element][valid] for f in _kept(scan)}
+    attributes = {}
     for field in _kept(scan):
-        attributes[field.name] += field.dtype.type(field.plus)
+        values = columns[field.element][valid]
+        attributes[field.name] = (values + field.plus if field.plus else values).astype(field.dtype, copy=False)
     if scan.pose and all(name in attributes for name in NORMALS):
         turned = scan.pose.turn(np.column_stack([attributes[name] for name in NORMALS]))
         attributes |= {n: turned[:, k].astype(attributes[n].dtype) for k, n in enumerate(NORMALS)}
@@ -241,7 +251,7 @@ def _fields(points: Any) -> tuple[Field, ...]:
             low, high = number.minimum(), number.maximum()
             # E57 counts returns from 0, everyone else from 1.
             plus = int(element == "returnIndex" and not scaled)
-            dtype = np.dtype("f8") if scaled else _integer(low, high + plus)
+            dtype = np.dtype("f8") if scaled else _integer(low + plus, high + plus)
             fields.append(Field(element, name, dtype, (high - low).bit_length(), plus))
     return tuple(fields)
 
