@@ -6,7 +6,6 @@ import hashlib
 import os
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
 from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -136,9 +135,16 @@ def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -
         points=0 if found.isolated is None else len(found.isolated),
         isolated=isolated,
         pose=pose,
-        deviation=None
-        if deviation is None
-        else schema.DeviationEntry(**{key: _or_none(value) for key, value in asdict(deviation).items()}),
+        deviation=None if deviation is None else _deviation_entry(deviation),
+    )
+
+
+def _deviation_entry(deviation: Deviation) -> schema.DeviationEntry:
+    return schema.DeviationEntry(
+        mean_m=_or_none(deviation.mean_m),
+        rms_m=_or_none(deviation.rms_m),
+        p95_m=_or_none(deviation.p95_m),
+        worst_m=_or_none(deviation.worst_m),
     )
 
 
