@@ -6,6 +6,7 @@ PYTHON ?= python3.11
 VENV ?= .venv
 BIN := $(VENV)/bin
 DEMO ?= demo
+SOURCES := $(shell find src -name '*.py')
 
 .PHONY: demo test fast lint clean
 
@@ -26,14 +27,14 @@ lint: $(VENV)/developed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# Installed twice over is harmless: the developer's install holds all of the user's.
-$(VENV)/installed: pyproject.toml | $(BIN)/python
-	$(BIN)/pip install --quiet .
+# The developers' install is editable and so never out of date; where it is there, users' work is done with it.
+$(VENV)/installed: pyproject.toml $(SOURCES) | $(BIN)/python
+	test -f $(VENV)/developed || $(BIN)/pip install --quiet .
 	touch $@
 
 $(VENV)/developed: pyproject.toml | $(BIN)/python
 	$(BIN)/pip install --quiet --editable '.[dev]'
-	touch $@ $(VENV)/installed
+	touch $@
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
