@@ -114,7 +114,8 @@ def as_declared(values: NDArray[Any], dtype: np.dtype[Any], valid: NDArray[np.bo
             return values.astype(dtype)
     kept = np.where(valid, values, 0)
     if not fits(kept, dtype):
-        msg = f"{what} is declared {dtype}, but holds other numbers: declare it double"
+        misfit = next(value for value in kept.tolist() if not fits(np.array([value]), dtype))
+        msg = f"{what} is {dtype} by the file's header or first rows, but holds {misfit}"
         raise UnreadableFileError(msg)
     return kept.astype(dtype)
 
