@@ -310,8 +310,8 @@ def test_a_shop_shows_its_target_in_the_clutter_asked_for(which: str, spool_shop
     assert list(scene.truth()) == [which]
     found = scan(scene, points=200_000)
     on = len(found.points_on(target))
-    # The pilot that chose the stations saw a hundred points on the target: a tenth off is its luck.
-    assert CLUTTER[0] * 0.85 < (len(found) - on) / on < CLUTTER[1] * 1.15
+    # With some thousand points on the target, one in twenty is luck.
+    assert CLUTTER[0] * 0.95 < (len(found) - on) / on < CLUTTER[1] * 1.05
     assert scene.visible_share(target) >= 0.3
     assert sum(name == "other_spool" for name in found.object_names) >= 4
     for thing in scene.objects[1:]:
@@ -376,4 +376,4 @@ def test_ten_million_points(make: Callable[[], Mesh]) -> None:
     found = scan(scene, points=10_000_000)
     assert len(found) == pytest.approx(10_000_000, rel=0.01)
     on = len(found.points_on(scene.target_ids()[0]))
-    assert CLUTTER[0] * 0.9 < (len(found) - on) / on < CLUTTER[1] * 1.1
+    assert CLUTTER[0] < (len(found) - on) / on < CLUTTER[1]
