@@ -298,17 +298,13 @@ def _distance(bounds: Floats) -> float:
 
 
 def _joint_bounds(scans: list[Scan]) -> tuple[tuple[float, float, float], tuple[float, float, float]] | None:
-    """The box around the posed boxes of all scans with points; None where one of them has none."""
-    corners: list[Floats] = []
-    for scan in scans:
-        if scan.bounds is None:
-            return None
-        box = np.array(np.meshgrid(*scan.bounds.T)).reshape(3, -1).T
-        corners.append(scan.pose.move(box) if scan.pose else box)
-    if not corners:
+    """The box around the boxes of all scans. None where one has no box, or has a pose: the standard wants boxes in the
+    scan's own frame, pye57 writes them in the file's.
+    """
+    boxes = [scan.bounds for scan in scans if scan.bounds is not None and scan.pose is None]
+    if not boxes or len(boxes) < len(scans):
         return None
-    every = np.vstack(corners)
-    low, high = every.min(axis=0).tolist(), every.max(axis=0).tolist()
+    low, high = np.min(boxes, axis=0)[0].tolist(), np.max(boxes, axis=0)[1].tolist()
     return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
 

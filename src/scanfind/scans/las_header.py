@@ -119,7 +119,7 @@ def parse_header(file: BinaryIO, size: int, name: str) -> LasHeader:
         start,
         scale,
         offset,
-        _bounds(numbers[6:]),
+        _bounds(numbers[6:], scale, offset),
         tuple(_extra_dimensions(records, record_bytes - FORMAT_BYTES[point_format])),
         laszip if compressed else None,
         _crs(records + extended),
@@ -196,8 +196,15 @@ def _crs(records: list[Record]) -> str | None:
     return f"EPSG:{code}" if code else None
 
 
-def _bounds(numbers: Floats) -> tuple[tuple[float, float, float], tuple[float, float, float]] | None:
-    high, low = numbers.reshape(3, 2).T.tolist()
-    if not np.isfinite(numbers).all() or any(a > b for a, b in zip(low, high, strict=True)):
+def _bounds(
+    numbers: Floats, scale: Floats, offset: Floats
+) -> tuple[tuple[float, float, float], tuple[float, float, float]] | None:
+    """The header's box, None where no 32-bit record could lie at its ends: some writers forget to scale it."""
+    high, low = numbers.reshape(3, 2).T
+    with np.errstate(over="ignore"):
+        reach = 2.0**31 * np.abs(scale) * (1 + 1e-9)
+        reached = (offset - reach <= low) & (low <= high) & (high <= offset + reach)
+    if not np.isfinite(numbers).all() or not reached.all():
         return None
-    return tuple(low), tuple(high)  # type: ignore[return-value]
+    a, b = low.tolist(), high.tolist()
+    return (a[0], a[1], a[2]), (b[0], b[1], b[2])
