@@ -87,7 +87,7 @@ def test_every_dimension_is_as_laspy_reads_it(name: str, shared_data: Path) -> N
 def test_a_second_record_of_extra_bytes_counts_too(shared_data: Path) -> None:
     # laspy stops at the first record and calls the rest of each point "ExtraBytes".
     (chunk,) = read_scan(shared_data / LASPY / "append-bug.laz")
-    assert [name for name in chunk.attributes][-2:] == ["Deviation", "confidence"]
+    assert list(chunk.attributes)[-2:] == ["Deviation", "confidence"]
     assert chunk.attributes["Deviation"].dtype == np.uint16
 
 
