@@ -290,3 +290,30 @@ def test_the_shift_is_in_the_pose_and_is_no_station(tmp_path: Path) -> None:
     assert (raw["cartesianX"][0], raw["cartesianZ"][0], raw["intensity"][0]) == (1.5, 3.5, 0.5)
     info = scan_info(path)
     assert (info.stations[0].origin, info.crs) == (None, "LOCAL_CS[]")
+
+
+@pytest.mark.parametrize(
+    ("values", "limits"),
+    [
+        (np.array([7, 300, 20], np.uint16), [7, 300]),
+        (np.array([np.nan, -np.inf, 0.5], np.float32), [0.5, 0.5]),
+        (np.full(3, np.nan, np.float64), None),
+    ],
+)
+def test_intensity_limits_are_those_of_the_finite_values(
+    values: NDArray[Any], limits: list[float] | None, tmp_path: Path
+) -> None:
+    import pye57
+
+    path = tmp_path / "bright.e57"
+    with open_writer(path, {"intensity": values.dtype}) as writer:
+        for k in range(3):
+            writer.write(np.zeros((1, 3)), {"intensity": values[k : k + 1]})
+    (chunk,) = read_scan(path)
+    np.testing.assert_array_equal(chunk.attributes["intensity"], values)
+    with pye57.E57(str(path)) as file:
+        header = file.get_header(0)
+        if limits is None:
+            assert "intensityLimits" not in header.scan_fields
+        else:
+            assert [header.intensityMinimum, header.intensityMaximum] == limits

@@ -57,9 +57,10 @@ class Writer(CloudFile):
     def _append(self, xyz: Floats, columns: Columns) -> None:
         local = xyz - self.shift
         self._low, self._high = np.minimum(self._low, local.min(axis=0)), np.maximum(self._high, local.max(axis=0))
-        if "intensity" in columns:
-            self._darkest = min(self._darkest, float(np.nanmin(columns["intensity"])))
-            self._brightest = max(self._brightest, float(np.nanmax(columns["intensity"])))
+        intensity = columns.get("intensity", np.empty(0))
+        if (known := intensity[np.isfinite(intensity)]).size:
+            self._darkest = min(self._darkest, float(known.min()))
+            self._brightest = max(self._brightest, float(known.max()))
         # Returns are counted from 0 in E57.
         if "return_number" in columns:
             columns = columns | {"return_number": columns["return_number"].astype(np.int64) - 1}
