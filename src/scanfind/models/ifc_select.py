@@ -17,22 +17,23 @@ NOT_BUILT = frozenset({
 
 
 def choose(file: Any, select: Sequence[str], path: str) -> list[Any]:
-    """The products with a representation that `select` means, in the file's order; all built ones where it is empty.
+    """The products that `select` means, in the file's order; all built ones with a shape where it is empty.
 
     A selector that is a class of the schema means its products and those of its subclasses; any other is a GlobalId, or
-    the name of a product or of its type, with * and ?, in capitals or not. Raises UsageError where one means nothing.
+    the name of a product or of its type, with * and ?, in capitals or not. It may also mean a whole that only its parts
+    give a shape, such as an assembly; by class, if the parts are not of that class themselves. Raises UsageError for a
+    selector that means nothing.
     """
     schema = _Schema(file)
-    products = sorted(
-        (product for product in file.by_type("IfcProduct") if product.Representation), key=lambda product: product.id()
-    )
+    products = sorted(file.by_type("IfcProduct"), key=lambda product: product.id())
+    shaped = [product for product in products if product.Representation]
     if not select:
-        return [product for product in products if not schema.lineage(product) & NOT_BUILT]
+        return [product for product in shaped if schema.is_built(product)]
     chosen = {}
     for selector in select:
         found = _selected(products, selector, schema)
         if not found:
-            counts = Counter(product.is_a() for product in products).most_common()
+            counts = Counter(product.is_a() for product in shaped).most_common()
             has = ", ".join(f"{kind} {count}" for kind, count in counts) or "nothing with a shape"
             msg = (
                 f"nothing in {path} matches {selector!r}; it has {has}: select a class, a name (* and ?) or a GlobalId"
@@ -40,6 +41,23 @@ def choose(file: Any, select: Sequence[str], path: str) -> list[Any]:
             raise UsageError(msg)
         chosen.update({product.id(): product for product in found})
     return [chosen[number] for number in sorted(chosen)]
+
+
+def members(product: Any) -> list[Any]:
+    """The product itself if it has a shape, else those of its parts, and theirs, that have one."""
+    found, open_, seen = [], [product], set()
+    while open_:
+        each = open_.pop()
+        # A damaged file may make a thing a part of itself.
+        if each.id() in seen:
+            continue
+        seen.add(each.id())
+        if each.Representation:
+            found.append(each)
+        else:
+            parts = (part for relation in each.IsDecomposedBy for part in relation.RelatedObjects)
+            open_ += [part for part in parts if part.is_a("IfcProduct")]
+    return sorted(found, key=lambda member: member.id())
 
 
 def type_name(product: Any) -> str:
@@ -53,15 +71,27 @@ def type_name(product: Any) -> str:
 
 def _selected(products: Sequence[Any], selector: str, schema: _Schema) -> list[Any]:
     kind = schema.class_named(selector)
-    if kind is not None:
-        # IfcElement also is the class of holes: they are meant only where the selector is a kind of them.
-        skip = NOT_BUILT if not schema.ancestors(kind) & NOT_BUILT else frozenset()
-        return [p for p in products if kind in (lineage := schema.lineage(p)) and not lineage & skip]
-    pattern = selector.lower()
+    if kind is None:
+        pattern = selector.lower()
+        meant = [
+            product for product in products
+            if product.GlobalId == selector
+            or any(fnmatchcase(name.lower(), pattern) for name in (product.Name or "", type_name(product)))
+        ]  # fmt: skip
+        return [product for product in meant if _has_shape(product, schema)]
+    # IfcElement is the class of holes, too: they are meant only where the selector is a kind of them.
+    holes_too = bool(schema.ancestors(kind) & NOT_BUILT)
+    meant = [p for p in products if kind in schema.lineage(p) and (holes_too or schema.is_built(p))]
     return [
-        p for p in products
-        if p.GlobalId == selector or any(fnmatchcase(name.lower(), pattern) for name in (p.Name or "", type_name(p)))
+        product for product in meant
+        if product.Representation
+        or (_has_shape(product, schema) and not any(kind in schema.lineage(part) for part in members(product)))
     ]  # fmt: skip
+
+
+def _has_shape(product: Any, schema: _Schema) -> bool:
+    """Whether it has a shape, or is an element whose parts have one; a storey is not the sum of what stands in it."""
+    return bool(product.Representation) or (schema.is_built(product) and bool(members(product)))
 
 
 class _Schema:
@@ -87,3 +117,6 @@ class _Schema:
 
     def lineage(self, product: Any) -> frozenset[str]:
         return self.ancestors(product.is_a())
+
+    def is_built(self, product: Any) -> bool:
+        return not self.lineage(product) & NOT_BUILT

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,6 +24,10 @@ class Part(NamedTuple):
     faces: NDArray[Any]
 
 
+# An assembly of more is a list of triangles by another name, and facing each outwards by itself would take minutes.
+MOST_PARTS = 10_000
+
+
 def join(name: str, parts: Iterable[Part], source: str, scale: float = 1.0) -> Mesh:
     """One mesh of all the parts: a CAD assembly is one object.
 
@@ -32,6 +36,9 @@ def join(name: str, parts: Iterable[Part], source: str, scale: float = 1.0) -> M
     Its notes: `parts`, ((name, first face, face after the last), …); `watertight`, whether every part is; `turned`, how
     many parts came inside out. Raises InvalidGeometryError as `Mesh.of` does, and where there is no triangle at all.
     """
+    parts = list(parts)
+    if len(parts) > MOST_PARTS:
+        parts = [as_one(parts)._replace(name=name)]
     vertices, faces, bounds, closed, turned = [], [], [], [], 0
     first_vertex = first_face = 0
     for part in parts:
@@ -62,6 +69,13 @@ def moved(part: Part, matrix: Floats) -> Part:
     linear = matrix[:3, :3]
     faces = part.faces[:, ::-1] if np.linalg.det(linear) < 0 else part.faces
     return Part(part.name, part.vertices @ linear.T + matrix[:3, 3], faces)
+
+
+def as_one(parts: Sequence[Part]) -> Part:
+    """All of at least one part in one, under the first one's name."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    faces = [part.faces + start for part, start in zip(parts, starts, strict=True)]
+    return Part(parts[0].name, np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
 
 
 def _names_its_vertices(part: Part) -> bool:
