@@ -215,6 +215,16 @@ def test_a_hostile_header_is_one_line(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("at", [16, 24, 32, 40])
+@pytest.mark.parametrize("number", [0, 2**31, 2**63, 2**64 - 1])
+def test_a_hostile_file_header_is_one_line(at: int, number: int, template: Template, tmp_path: Path) -> None:
+    content = bytearray(template.file(template.xml))
+    struct.pack_into("<Q", content, at, number)
+    path = tmp_path / "hostile.e57"
+    path.write_bytes(with_checksums(bytes(content)))
+    assert isinstance(points_or_line(path), str)
+
+
 def test_a_scan_of_one_sweep_far_from_its_own_origin_was_moved(shared_data: Path, tmp_path: Path) -> None:
     template = Template(shared_data / PUMP)
     path = tmp_path / "moved.e57"

@@ -94,7 +94,7 @@ def info(path: Path) -> ScanInfo:
         format="E57",
         points=sum(scan.records for scan in scans),
         stations=tuple(Station(s.name, s.records, _triple(s.origin)) for s in scans),
-        attributes={name: dtype.str.lstrip("<|") for name, dtype in dtypes.items()},
+        attributes={name: str(dtype) for name, dtype in dtypes.items()},
         bounds=_joint_bounds(scans),
         crs=crs or None,
     )

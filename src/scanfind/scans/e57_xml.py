@@ -14,7 +14,8 @@ from scanfind.errors import UnreadableFileError
 
 # Real files nest about ten deep; a structure has tens of children. Vectors (scans, images) are long, and linear.
 DEEPEST, MOST_CHILDREN = 64, 1000
-CHECKSUM_BYTES = 4
+# Each page ends with its checksum, which is no part of the text.
+PAGE_BYTES, PAYLOAD_BYTES = 1024, 1020
 
 
 def check_xml(path: Path) -> None:
@@ -29,15 +30,14 @@ def check_xml(path: Path) -> None:
         if whole > size:
             msg = f"{path.name} is cut short: its header promises {whole:,} bytes, {size:,} are there"
             raise UnreadableFileError(msg)
-        if page < 48 or start + length > size:
+        if page != PAGE_BYTES or start + length > size:
             msg = f"{path.name} is damaged: XML of {length:,} bytes at byte {start:,} of {size:,}, pages of {page:,}"
             raise UnreadableFileError(msg)
-        first = start // page * page
-        file.seek(first)
-        # Each page ends with its checksum, which is no part of the text.
-        pages = file.read(start - first + (length // (page - CHECKSUM_BYTES) + 2) * page)
-    text = b"".join(pages[at : at + page - CHECKSUM_BYTES] for at in range(0, len(pages), page))
-    _check_shape(text[start - first :][:length], path.name)
+        within = start % PAGE_BYTES
+        file.seek(start - within)
+        pages = file.read(((within + length) // PAYLOAD_BYTES + 1) * PAGE_BYTES)
+    text = b"".join(pages[at : at + PAYLOAD_BYTES] for at in range(0, len(pages), PAGE_BYTES))
+    _check_shape(text[within : within + length], path.name)
 
 
 def _check_shape(text: bytes, name: str) -> None:

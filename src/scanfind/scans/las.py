@@ -27,7 +27,7 @@ def info(path: Path) -> ScanInfo:
         format=("LAZ " if header.laszip else "LAS ") + header.version,
         points=header.points,
         stations=(Station(path.stem, header.points),),
-        attributes={name: values.dtype.str.lstrip("<|") for name, values in empty.items()},
+        attributes={name: str(values.dtype) for name, values in empty.items()},
         bounds=header.bounds,
         crs=header.crs,
     )
