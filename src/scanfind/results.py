@@ -11,9 +11,10 @@ import unicodedata
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from scanfind import schema
+from scanfind.cloud import shift_for
 from scanfind.document import document, model_entries
 from scanfind.errors import OutputError, UnreadableFileError
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from scanfind.library import ModelLibrary
     from scanfind.pose import Pose
     from scanfind.progress import Progress
+    from scanfind.scans import CloudWriter
 
 RESULTS_JSON = "results.json"
 RESULTS_CSV = "results.csv"
@@ -140,6 +142,24 @@ def fill_folder(
     results = results.model_copy(update={"timings_s": timings})
     (folder / RESULTS_JSON).write_text(results.to_json() + "\n", encoding="utf-8")
     return results
+
+
+def open_remainder(path: Path, scans: Sequence[str | Path]) -> CloudWriter:
+    """A cloud file with room for every field of the scans, and for scan_id and source_index.
+
+    Raises as `scan_info` and `open_writer` do.
+    """
+    import numpy as np
+
+    from scanfind.scans import open_writer, scan_info
+
+    infos = [scan_info(scan) for scan in scans]
+    fields: dict[str, np.dtype[Any]] = {}
+    for name, kind in (field for info in infos for field in info.attributes.items()):
+        fields[name] = np.promote_types(fields.get(name, kind), kind)
+    fields |= {"scan_id": np.dtype(np.int32), "source_index": np.dtype(np.int64)}
+    corner = next((info.bounds[0] for info in infos if info.bounds), (0.0, 0.0, 0.0))
+    return open_writer(path, fields, shift=shift_for(corner), crs=next((info.crs for info in infos if info.crs), None))
 
 
 def read_results(folder: str | Path) -> schema.Results:

@@ -5,6 +5,7 @@ Everything is in metres, radians and the scan file's own frame. A number that do
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -122,5 +123,7 @@ class Results(Entry):
     peak_memory_bytes: int
 
     def to_json(self) -> str:
-        """The text of results.json, one line's indent two blanks, keys in the order above."""
-        return self.model_dump_json(indent=2, by_alias=True)
+        """The text of results.json: two blanks a level, keys in the order above, a list of plain values on one line."""
+        text = self.model_dump_json(indent=2, by_alias=True)
+        # No string of JSON holds a line break as it is, so what spans lines is structure.
+        return re.sub(r"\[\n\s+([^][{}]*?)\n\s+\]", lambda found: f"[{re.sub(r',\n\s+', ', ', found[1])}]", text)

@@ -31,7 +31,7 @@ def _version() -> str:
     return __version__
 
 
-app = App(name="scanfind", help=HELP, version=_version, help_format="plaintext")
+app = App(name="scanfind", help=HELP, version=_version, help_format="plaintext", suppress_keyboard_interrupt=False)
 app.command(find, usage="scanfind find SCAN... (--model FILE... | --library LIB) [OPTIONS]")
 app.command(library)
 app.command(isolate, usage="scanfind isolate RESULT_DIR SCAN... [OPTIONS]")

@@ -100,13 +100,13 @@ def find(
         msg = "find: --remainder has nowhere to go: give --out DIR"
         raise UsageError(msg)
 
-    from scanfind.cli.inputs import open_models, open_remainder
+    from scanfind.cli.inputs import open_models
     from scanfind.config import load_settings
     from scanfind.document import document, model_entries
     from scanfind.find import PRESETS
     from scanfind.find import find as find_models
     from scanfind.progress import progress_on
-    from scanfind.results import fill_folder, result_folder
+    from scanfind.results import fill_folder, open_remainder, result_folder
 
     flags = {
         "preset": preset, "seed": seed, "jobs": jobs, "units": units, "origin": origin, "format": format,

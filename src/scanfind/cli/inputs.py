@@ -1,4 +1,4 @@
-"""What the commands read: models into a library, and what fields the scans bring."""
+"""What the commands read: model files into a library."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from scanfind.config import Run
     from scanfind.find import Parameters
     from scanfind.library import ModelLibrary
-    from scanfind.scans import CloudWriter
 
 
 @contextmanager
@@ -44,19 +43,3 @@ def add_models(models: ModelLibrary, files: Sequence[Path], run: Run, parameters
                 note(f"{model.name}: {model.notes['hint']}")
             names.append(models.add(model, prepared).name)
     return names
-
-
-def open_remainder(path: Path, scans: Sequence[Path]) -> CloudWriter:
-    """A cloud file that has room for every field of the scans, and for scan_id and source_index."""
-    import numpy as np
-
-    from scanfind.scans import open_writer, scan_info
-
-    fields: dict[str, np.dtype[np.generic]] = {}
-    infos = [scan_info(scan) for scan in scans]
-    for info in infos:
-        for name, kind in info.attributes.items():
-            dtype = np.dtype(kind)
-            fields[name] = np.promote_types(fields[name], dtype) if name in fields else dtype
-    fields |= {"scan_id": np.dtype(np.int32), "source_index": np.dtype(np.int64)}
-    return open_writer(path, fields, crs=next((info.crs for info in infos if info.crs), None))

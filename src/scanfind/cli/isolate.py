@@ -47,7 +47,5 @@ def isolate(
     from scanfind.progress import progress_on
 
     with progress_on() as progress:
-        results = isolate_again(
-            result_dir, scans, tolerance=tolerance, out=out or result_dir, format=format, progress=progress
-        )
+        results = isolate_again(result_dir, scans, tolerance=tolerance, out=out, format=format, progress=progress)
     report(results, out or result_dir, json=json)

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 FOUND = (
     "id", "model", "x m", "y m", "z m", "yaw °", "pitch °", "roll °", "score", "visible %", "rms mm", "points",
-    "deviation mm", "free to",
+    "mean mm", "95 % mm", "free to",
 )  # fmt: skip
 
 
@@ -28,7 +28,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def found_table(results: Results) -> str:
-    """One line a detection."""
+    """One line a detection; "mean" and "95 %" are of the signed, and of the absolute distances of its points."""
     return table(FOUND, [_found_row(found) for found in results.detections])
 
 
@@ -61,13 +61,14 @@ def _found_row(found: DetectionEntry) -> list[str]:
     return [
         str(found.id),
         found.model,
-        *(f"{value:.3f}" for value in found.translation_m),
-        *(f"{value:.2f}" for value in turned(found.scene_from_model)),
+        *(_number(value, 3) for value in found.translation_m),
+        *(_number(value, 2) for value in turned(found.scene_from_model)),
         _number(found.score, 2),
         _number(found.visible_support, 0, 100.0),
         _number(found.rms_m, 1, 1e3),
         f"{found.points:,}",
-        "–" if deviation is None else f"{_number(deviation.mean_m, 1, 1e3)} ± {_number(deviation.rms_m, 1, 1e3)}",
+        _number(deviation.mean_m if deviation else None, 1, 1e3),
+        _number(deviation.p95_m if deviation else None, 1, 1e3),
         ", ".join(motion.kind for motion in found.unobservable) or "–",
     ]
 
@@ -77,7 +78,7 @@ def _closeness(refused: RefusedEntry) -> float:
 
 
 def _number(value: float | None, decimals: int, factor: float = 1.0) -> str:
-    return "–" if value is None else f"{value * factor:.{decimals}f}"
+    return "–" if value is None else f"{value * factor:z.{decimals}f}"
 
 
 def _is_number(cell: str) -> bool:
