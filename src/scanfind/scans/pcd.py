@@ -74,12 +74,12 @@ def _text_blocks(file: BinaryIO, header: PcdHeader, name: str) -> Iterator[Block
     dtypes = [column.dtype for column in header.columns]
     columns = {attribute: (k, dtypes[k]) for k, attribute in header.attributes.items()}
     if header.packed is not None:
-        columns["packed"] = header.packed, dtypes[header.packed]
+        columns["rgb"] = header.packed, dtypes[header.packed]
     for table in declared_rows(lines, dtypes, header.points, name):
         block = declared_block(table, header.xyz, columns, name)
         attributes = dict(block.attributes)
         if header.packed is not None:
-            attributes |= unpacked(attributes.pop("packed"), with_alpha=header.has_alpha)
+            attributes |= unpacked(attributes.pop("rgb"), with_alpha=header.has_alpha)
         yield Block(block.xyz, attributes)
 
 

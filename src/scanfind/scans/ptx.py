@@ -42,6 +42,9 @@ def read_scan_header(lines: Lines, name: str) -> PtxScan:
     """The ten lines before a scan's rows; raises UnreadableFileError."""
     entries = [_entry(lines, count, what, name) for count, what in HEADER]
     columns, rows = (whole_number(entries[k][0], f"{name}: {HEADER[k][1]}") for k in (0, 1))
+    if max(columns, rows) > np.iinfo(np.int32).max:
+        msg = f"{name} is damaged: {columns:,} columns of {rows:,} points, no scanner has such a grid"
+        raise UnreadableFileError(msg)
     matrix = np.array(entries[6:], dtype=np.float64)
     if not np.isfinite(matrix).all() or (matrix[:, 3] != [0, 0, 0, 1]).any():
         msg = f"{name} is damaged: the last column of a transform is 0 0 0 1, got {matrix[:, 3].tolist()}"

@@ -136,12 +136,12 @@ def header_lines(file: BinaryIO, name: str, last: str) -> Iterator[list[str]]:
     left = LONGEST_HEADER
     while line := file.readline(left):
         left -= len(line)
+        if left <= 0:
+            break
         words = line.decode("utf-8", "replace").split()
         yield words
         if words[:1] == [last]:
             return
-        if left <= 0:
-            break
     msg = f"{name} is damaged: its header does not end (no line begins with {last})"
     raise UnreadableFileError(msg)
 

@@ -64,9 +64,11 @@ def columns_of(
 def header_names(line: str) -> list[str] | None:
     """The names in a header line, comment signs apart; None for a row of numbers."""
     line = line.strip().lstrip("#/").strip()
-    separator = next((mark for mark in ";,\t" if mark in line), "")
-    cells = split(line, separator)
-    return None if all(map(is_number, cells)) else cells
+    layout = layout_of(line.encode())
+    if all(is_number(cell.replace(layout.decimal, ".")) for cell in split(line, layout.separator)):
+        return None
+    # Names may have spaces in them where tabs divide.
+    return split(line, next((mark for mark in ";,\t" if mark in line), ""))
 
 
 def guessed_names(table: Sequence[NDArray[Any]]) -> list[str]:
