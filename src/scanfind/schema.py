@@ -126,4 +126,4 @@ class Results(Entry):
         """The text of results.json: two blanks a level, keys in the order above, a list of plain values on one line."""
         text = self.model_dump_json(indent=2, by_alias=True)
         # No string of JSON holds a line break as it is, so what spans lines is structure.
-        return re.sub(r"\[\n\s+([^][{}]*?)\n\s+\]", lambda found: f"[{re.sub(r',\n\s+', ', ', found[1])}]", text)
+        return re.sub(r"\[\n\s+([^][{}]*?)\n\s+\]", lambda x: "[" + re.sub(r"\n\s+", " ", x[1]) + "]", text)
