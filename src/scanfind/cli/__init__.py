@@ -15,6 +15,7 @@ from scanfind.cli.find import find
 from scanfind.cli.info import info
 from scanfind.cli.isolate import isolate
 from scanfind.cli.library import library
+from scanfind.cli.options import note
 from scanfind.errors import Interrupted, ScanfindError, UsageError
 
 HELP = """Find known 3D objects (CAD, BIM or a piece of scan) in cluttered laser scans.
@@ -66,5 +67,5 @@ def _fail(why: object, code: int) -> int:
         import traceback
 
         traceback.print_exc()
-    print("scanfind:", " ".join(str(why).split()), file=sys.stderr)
+    note(str(why))
     return code

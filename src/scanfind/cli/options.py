@@ -30,5 +30,5 @@ def say(text: str) -> None:
 
 
 def note(text: str) -> None:
-    """Print a remark for people on stderr."""
-    print("scanfind:", text, file=sys.stderr)
+    """Print a remark for people on stderr, in one line."""
+    print("scanfind:", " ".join(text.split()), file=sys.stderr)
