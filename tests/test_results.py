@@ -65,6 +65,7 @@ def findings(tmp_path: Path) -> Findings:
     found.refused = [Refused("frame", _pose(rng), 0.3, 0.4, 0.5, float("nan"), "seen through at 12 % of its surface")]
     found.scans = [SceneScan(str(scan), 1_000, 17, ((1.0, 2.0, 3.0), None))]
     found.shift, found.crs, found.notes = (650_000.0, 5_100_000.0, 0.0), None, ["one scan has no origin"]
+    found.tolerance_m = 0.01
     found.timings_s = {"read": 1.0, "search": 2.5, "total": 4.0}
     return found
 

@@ -114,7 +114,10 @@ class SceneScan:
 
 
 class Findings(list[Detection]):
-    """The detections, best first, with what a report needs around them."""
+    """The detections, best first, with what a report needs around them.
+
+    tolerance_m : within which raw points were isolated, metres; None where they were not
+    """
 
     refused: list[Refused]
     scans: list[SceneScan]
@@ -122,8 +125,9 @@ class Findings(list[Detection]):
     crs: str | None
     timings_s: dict[str, float]
     notes: list[str]
+    tolerance_m: float | None
 
     def __init__(self, detections: list[Detection] | None = None) -> None:
         super().__init__(detections or [])
         self.refused, self.scans, self.notes = [], [], []
-        self.shift, self.crs, self.timings_s = (0.0, 0.0, 0.0), None, {}
+        self.shift, self.crs, self.timings_s, self.tolerance_m = (0.0, 0.0, 0.0), None, {}, None

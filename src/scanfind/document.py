@@ -52,6 +52,7 @@ def document(
         parameters=to_jsonable_python(parameters),
         shift_m=findings.shift,
         crs=findings.crs,
+        tolerance_m=findings.tolerance_m,
         scans=[
             schema.ScanEntry(
                 path=_text(scan.path),
@@ -78,7 +79,7 @@ def findings_of(results: schema.Results) -> Findings:
     findings.refused = [_refused(entry) for entry in results.refused]
     findings.scans = [SceneScan(scan.path, scan.points, scan.dropped, tuple(scan.stations_m)) for scan in results.scans]
     findings.shift, findings.crs, findings.notes = results.shift_m, results.crs, list(results.notes)
-    findings.timings_s = dict(results.timings_s)
+    findings.timings_s, findings.tolerance_m = dict(results.timings_s), results.tolerance_m
     return findings
 
 

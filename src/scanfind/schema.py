@@ -105,7 +105,10 @@ class RefusedEntry(Entry):
 
 
 class Results(Entry):
-    """results.json. `shift_m` was taken off while computing; every coordinate here has it added back."""
+    """results.json. `shift_m` was taken off while computing; every coordinate here has it added back.
+
+    `tolerance_m` is within which points were isolated, null where they were not.
+    """
 
     schema_: int = Field(SCHEMA, alias="schema")
     scanfind: str
@@ -113,6 +116,7 @@ class Results(Entry):
     parameters: dict[str, Any]
     shift_m: Vector
     crs: str | None
+    tolerance_m: float | None = None
     scans: list[ScanEntry]
     models: list[ModelEntry]
     detections: list[DetectionEntry]
