@@ -17,8 +17,8 @@ BLOCK_BYTES = 1 << 22
 LONGEST_LINE = 1 << 16
 MISSING = ("", "nan", "NaN", "NAN", "-nan", "-NaN", "nan(ind)", "-nan(ind)", "1.#QNAN", "-1.#IND", "NA", "N/A", "null")
 
-_NO_ROW = re.compile(rb"^[ \t]*(?:(?:#|//).*)?$", re.MULTILINE)
-_BLANK_OR_COMMENT = np.frombuffer(b" \t#/", np.uint8)
+_NO_ROW = re.compile(rb"^[ \t\v\f]*(?:(?:#|//).*)?$", re.MULTILINE)
+_BLANK_OR_COMMENT = np.frombuffer(b" \t\v\f#/", np.uint8)
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?inf(?:inity)?", re.ASCII | re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?", re.ASCII)
 
@@ -147,7 +147,9 @@ def parse(rows: Rows, layout: Layout, name: str) -> list[NDArray[Any]]:
     Missing numbers are NaN. Raises UnreadableFileError with the line that is not a row of `layout`.
     """
     # pandas fails without saying where, and fills short rows with NaN. So: fast if all is well, else line by line.
-    return _parse_fast(rows, layout) or parse_slowly(rows, layout, name)
+    # Integers of 64 bits, rare in text, always go line by line: pandas takes them by way of doubles if it has to.
+    fast = None if layout.wide else _parse_fast(rows, layout)
+    return fast or parse_slowly(rows, layout, name)
 
 
 def parse_slowly(rows: Rows, layout: Layout, name: str) -> list[NDArray[Any]]:
@@ -155,7 +157,7 @@ def parse_slowly(rows: Rows, layout: Layout, name: str) -> list[NDArray[Any]]:
     table: list[list[float | int]] = []
     wide = dict(layout.wide)
     for number, line in enumerate(rows.text.decode("utf-8", "replace").split("\n"), rows.line):
-        if not line.strip():
+        if not line:
             continue
         cells = split(line, layout.separator)
         if len(cells) != layout.columns:
@@ -185,7 +187,6 @@ def _parse_fast(rows: Rows, layout: Layout) -> list[NDArray[Any]] | None:
     """As `parse`, by pandas; None where a row may be wrong."""
     import pandas as pd
 
-    wide = dict(layout.wide)
     text = rows.text.replace(b'"', b"") if b'"' in rows.text else rows.text
     try:
         frame = pd.read_csv(
@@ -193,7 +194,7 @@ def _parse_fast(rows: Rows, layout: Layout) -> list[NDArray[Any]] | None:
             sep=layout.separator or r"\s+",
             decimal=layout.decimal,
             header=None,
-            dtype={k: wide.get(k, np.float64) for k in range(layout.columns)},
+            dtype=np.float64,
             na_values=list(MISSING),
             keep_default_na=False,
             quoting=3,  # csv.QUOTE_NONE: an open quote must not swallow lines
@@ -206,7 +207,7 @@ def _parse_fast(rows: Rows, layout: Layout) -> list[NDArray[Any]] | None:
         return None
     columns = [frame[k].to_numpy() for k in range(layout.columns)]
     # No row is longer than the first, so all are complete if there are enough cells in total.
-    if columns[-1].dtype.kind == "f" and np.isnan(columns[-1]).any():
+    if np.isnan(columns[-1]).any():
         cells = text.count(layout.separator.encode()) + rows.count if layout.separator else len(text.split())
         if cells != rows.count * layout.columns:
             return None
