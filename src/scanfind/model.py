@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from scanfind.cloud import CloudModel, OrientedCloud
+from scanfind.cloud_surface import sample_cloud
 from scanfind.mesh import Mesh, Placement
 from scanfind.pairs import PairParameters, PairTable, build_pairs
 from scanfind.surface import SurfaceParameters, sample_mesh
@@ -94,8 +95,6 @@ def build_model(model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS
         # Notes are for the person who reads the file; the library keeps what the search needs.
         mesh, cloud = Mesh(model.name, model.vertices, model.faces, model.source, model.placements), None
     else:
-        from scanfind.surfels import sample_cloud
-
         surface = sample_cloud(model, parameters.surface)
         mesh, cloud = None, model
     return Model(

@@ -19,10 +19,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scanfind.cloud import OrientedCloud, as_points
+from scanfind.cloud_surface import oriented
 from scanfind.errors import InvalidGeometryError
 
 if TYPE_CHECKING:
     from scanfind.kernels.distance import NearSurface
+    from scanfind.model import Model
 
 Floats = NDArray[np.float64]
 
@@ -56,6 +58,16 @@ def near_triangles(
     normals = unit_normals(corners)
     toward_outside = pseudonormals(corners, normals)
     return in_tree_order(corners, normals, toward_outside, np.flatnonzero(seen), reach, 0.0, signed)
+
+
+def near_model(model: Model, reach: float) -> NearSurface:
+    """The surface of a model from the library: the triangles of a mesh, the points of a piece of scan."""
+    if model.mesh is not None:
+        return near_triangles(model.mesh.triangles(), reach)
+    if model.cloud is None:
+        return near_samples(model.samples, model.spacing, reach)
+    surface, cell = oriented(model.cloud)
+    return near_samples(surface, 1.5 * cell, reach)
 
 
 def near_samples(cloud: OrientedCloud, spacing: float, reach: float) -> NearSurface:

@@ -1,7 +1,7 @@
 """The surfel grid: one streaming pass over the raw points answers everything the method asks of a scene.
 
-Each cell keeps moments: n, Σx, Σxxᵀ, Σ direction to the scanner. Their means are the paper's weighted octree (3.1), their
-pooled covariance its normals by PCA (3.2), their bits its support count; moments add, so chunks, files and workers merge.
+Each cell keeps moments: n, Σx, Σxxᵀ, Σ direction to the scanner. Their means are the paper's weighted octree (3.1),
+their pooled covariance its normals by PCA (3.2); moments add, so levels, chunks, files and workers merge.
 """
 
 from __future__ import annotations
@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.cloud import SHIFT_BEYOND_M, OrientedCloud, PointChunk
+from scanfind.cloud import PointChunk
 
 if TYPE_CHECKING:
-    from scanfind.cloud import CloudModel
-    from scanfind.surface import ModelSurface, SurfaceParameters
+    pass
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -34,14 +33,14 @@ class GridParameters:
         until the scan fills them
     cells_across : how many cells the diameter of the smallest model spans; 180 makes 20 mm of a 3.6 m spool
     least_cells_across : never fewer, however sparse the scan
-    points_per_cell : the median cell must hold so many points, or cells are doubled; fewer make poor normals
+    points_per_cell : a cell must hold so many points on average, or cells are doubled; fewer make poor normals
     min_neighbours : occupied cells of the 3×3×3 (itself included) below which a cell has no normal, only presence
     """
 
     cell_m: float | None = None
     cells_across: float = 180.0
     least_cells_across: float = 40.0
-    points_per_cell: float = 4.0
+    points_per_cell: float = 2.0
     min_neighbours: int = 5
 
 
@@ -72,9 +71,9 @@ class Surfels(NamedTuple):
     points: Floats
     signed: bool
 
-    def oriented(self) -> NDArray[np.intp]:
-        """The surfels that have a normal."""
-        return np.flatnonzero((self.normals != 0.0).any(axis=1))
+    def has_normal(self) -> NDArray[np.bool_]:
+        """Which surfels have a normal, (S,)."""
+        return np.asarray((self.normals != 0.0).any(axis=1))
 
 
 class DepthMap(NamedTuple):
@@ -139,7 +138,7 @@ class MomentGrid:
         self.unaddressable = int(self._counts[2])
 
     def _make_room(self) -> None:
-        """Double whichever array is full. Grown as blocks appear: allocating for the worst case cost more than the pass."""
+        """Double whichever array is full: allocating for the worst case cost more than the pass itself."""
         from scanfind.kernels.blocks import fill_hash
 
         if self._counts[0] + 1 > len(self._block_keys):
@@ -151,10 +150,9 @@ class MomentGrid:
         if self._counts[1] + ROWS_AT_ONCE > len(self._moments):
             self._moments = np.concatenate([self._moments, np.empty_like(self._moments)])
 
-    def median_points(self) -> float:
-        """Raw points in the median cell, counting a cell once for each octant it was seen from."""
-        rows = self._moments[: self._counts[1], 0]
-        return float(np.median(rows)) if len(rows) else 0.0
+    def points_per_row(self) -> float:
+        """Raw points a cell, on average, counting a cell once for each octant it was seen from."""
+        return self.points / max(int(self._counts[1]), 1)
 
     def coarser(self) -> MomentGrid:
         """The next level of the octree: cells of twice the edge, each the sum of its eight children."""

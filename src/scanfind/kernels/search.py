@@ -36,42 +36,56 @@ def unit_interval(bits):
 
 @njit(cache=True, nogil=True)
 def draw_pairs(
-    start, stop, seed, stream, candidates, distance, max_tries, cell, hash_keys, hash_values, block_cells,
-    first_surfel, means, normals, first, second, tries,
+    start, stop, seed, stream, pool, bin_edge, hash_keys, hash_values, bin_starts, means, directions, distance,
+    tolerance, max_tries, first, second,
 ):  # fmt: skip
-    """Draw pairs number start … stop: s1 among the candidates, s2 by random directions on the sphere of radius d.
+    """Draw pairs number start … stop: s1 anywhere in the pool, s2 at distance ± tolerance from it.
 
-    candidates : (W,) surfels that may be s1; cell, hash_*, block_cells, first_surfel : the grid (see Surfels)
-    first, second : out, surfels of each pair, -1 where max_tries directions met no surfel with a normal
-    tries : out, directions taken
+    pool : (W,) surfels that may be drawn, sorted by the bin of edge `bin_edge` metres they lie in
+    hash_keys, hash_values, bin_starts : packed bin coordinates → bin; where each bin begins in the pool
+    directions : (Q, 3) unit, in random order, Q a power of two; each s1 takes them from a place of its own on
+    first, second : out, surfels of each pair; second is -1 where max_tries tries met none
+
+    A try looks where a direction leads and takes any surfel of that bin: a hundredth of them lie at the distance, so a
+    pair costs a hundred look-ups in a small table, whatever the size of the site.
     """
-    inverse = 1.0 / cell
+    inverse = 1.0 / bin_edge
+    near, far = max(0.0, distance - tolerance) ** 2, (distance + tolerance) ** 2
     for k in range(start, stop):
-        bits = random_bits(seed, stream, k * 1024)
-        one = candidates[np.int64(unit_interval(bits) * candidates.shape[0])]
-        first[k] = one
-        second[k] = -1
-        tries[k] = max_tries
-        for attempt in range(max_tries):
-            z = 2.0 * unit_interval(random_bits(seed, stream, k * 1024 + 2 * attempt + 1)) - 1.0
-            azimuth = 2.0 * pi * unit_interval(random_bits(seed, stream, k * 1024 + 2 * attempt + 2))
-            across = distance * sqrt(1.0 - z * z)
-            cx = np.int64(floor((means[one, 0] + across * cos(azimuth)) * inverse))
-            cy = np.int64(floor((means[one, 1] + across * sin(azimuth)) * inverse))
-            cz = np.int64(floor((means[one, 2] + distance * z) * inverse))
-            block = find_block(hash_keys, hash_values, pack_block(cx >> 3, cy >> 3, cz >> 3))
-            if block < 0:
+        one = pool[np.int64(unit_interval(random_bits(seed, stream, 2 * k)) * pool.shape[0])]
+        bits = random_bits(seed, stream, 2 * k + 1)
+        x, y, z = means[one, 0], means[one, 1], means[one, 2]
+        first[k], second[k] = one, -1
+        for _ in range(max_tries):
+            bits = bits * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+            way = directions[np.int64(bits >> np.uint64(33)) & (directions.shape[0] - 1)]
+            cx = np.int64(floor((x + distance * way[0]) * inverse))
+            cy = np.int64(floor((y + distance * way[1]) * inverse))
+            cz = np.int64(floor((z + distance * way[2]) * inverse))
+            there = find_block(hash_keys, hash_values, pack_block(cx, cy, cz))
+            if there < 0:
                 continue
-            found = block_cells[block, ((cx & 7) << 6) | ((cy & 7) << 3) | (cz & 7)]
-            if found < 0:
-                continue
-            # A cell with two faces offers both in turn.
-            two = first_surfel[found] + attempt % (first_surfel[found + 1] - first_surfel[found])
-            if normals[two, 0] == 0.0 and normals[two, 1] == 0.0 and normals[two, 2] == 0.0:
-                continue
-            second[k] = two
-            tries[k] = attempt + 1
-            break
+            low = bin_starts[there]
+            bits = bits * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+            two = pool[low + np.int64(unit_interval(bits) * (bin_starts[there + 1] - low))]
+            dx, dy, dz = means[two, 0] - x, means[two, 1] - y, means[two, 2] - z
+            if near <= dx * dx + dy * dy + dz * dz <= far:
+                second[k] = two
+                break
+
+
+@njit(cache=True, nogil=True)
+def count_partners(some, pool, means, distance, tolerance):
+    """How many surfels of the pool lie at distance ± tolerance from some surfels, on average."""
+    near, far = max(0.0, distance - tolerance) ** 2, (distance + tolerance) ** 2
+    total = 0
+    for i in range(some.shape[0]):
+        x, y, z = means[some[i], 0], means[some[i], 1], means[some[i], 2]
+        for j in range(pool.shape[0]):
+            dx, dy, dz = means[pool[j], 0] - x, means[pool[j], 1] - y, means[pool[j], 2] - z
+            if near <= dx * dx + dy * dy + dz * dz <= far:
+                total += 1
+    return total / max(some.shape[0], 1)
 
 
 @njit(cache=True, nogil=True)

@@ -129,7 +129,8 @@ def fit_surfels(
 ):  # fmt: skip
     """Fit one or two surfels in every cell of some blocks.
 
-    cell : edge, metres; units : offset units a cell; min_neighbours : occupied cells of the 3×3×3 a normal needs, the cell itself included
+    cell : edge, metres; units : offset units a cell
+    min_neighbours : occupied cells of the 3×3×3 a normal needs, the cell itself included
     n_sides : (V,) out: 1, or 2 where the scanners saw both faces of something thin
     means : (V, 2, 3) out: metres from the grid's offset
     normals : (V, 2, 3) out: unit, towards the scanner; zero where there are too few neighbours

@@ -1,0 +1,280 @@
+"""THE PAGE: the whole method, one step a line (Sharif, Nahangi, Haas & West 2017; section numbers are theirs)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scanfind.cloud import CloudModel, PointChunk, shift_for
+from scanfind.detection import Findings
+from scanfind.deviation import deviation_of
+from scanfind.errors import UsageError
+from scanfind.isolate import IsolateParameters, Placed
+from scanfind.isolate import isolate as isolate_raw
+from scanfind.library import ModelLibrary, joint_table
+from scanfind.mesh import Mesh
+from scanfind.model import Model, ModelParameters
+from scanfind.near_surface import near_model
+from scanfind.pairs import PairParameters
+from scanfind.recognise import Recognition
+from scanfind.refine import RefineParameters
+from scanfind.scene import build_scene, first_cell
+from scanfind.search import SearchParameters
+from scanfind.sources import Scan, Sources, require_points
+from scanfind.surface import SurfaceParameters
+from scanfind.surfels import GridParameters, MomentGrid
+from scanfind.threads import available_cores
+from scanfind.verify import VerifyParameters
+
+if TYPE_CHECKING:
+    from scanfind.detection import Detection
+    from scanfind.scans import CloudWriter
+
+STAGES = ("read", "library", "grid", "search", "verify", "refine", "isolate", "write", "total")
+
+ModelInput: TypeAlias = "ModelLibrary | Mesh | CloudModel | str | PathLike[str]"
+Progress: TypeAlias = Callable[[str, float, float], None]
+
+
+@dataclass(frozen=True)
+class IsolationParameters:
+    """Which raw points belong to a detection.
+
+    tolerance_m : those within this distance of the placed model's surface; None: `noises` times the scan's own noise
+        around the detection, at least a tenth and at most half of the grid's cell
+    """
+
+    tolerance_m: float | None = None
+    noises: float = 4.0
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Every parameter of the method, by stage."""
+
+    surface: SurfaceParameters = field(default_factory=SurfaceParameters)
+    pairs: PairParameters = field(default_factory=PairParameters)
+    grid: GridParameters = field(default_factory=GridParameters)
+    search: SearchParameters = field(default_factory=SearchParameters)
+    refine: RefineParameters = field(default_factory=RefineParameters)
+    verify: VerifyParameters = field(default_factory=VerifyParameters)
+    isolate: IsolationParameters = field(default_factory=IsolationParameters)
+
+
+PRESETS = {
+    "default": Parameters(),
+    # Table 2 of the paper and what its text says: one pair distance, uniform draws, normals of unit length, all of the
+    # time, five steps of ICP, the best single hypothesis by support alone.
+    "sharif2017": Parameters(
+        pairs=PairParameters(distances=(0.75,), rungs_per_octave=64, angle_cell_deg=12.0),
+        search=SearchParameters(
+            overlap_ratio=0.15, time_limit_s=20.0, miss_probability=0.0, max_instances=1, by_shape=False,
+            telling_first=False, normal_length_m=1.0,
+        ),
+        refine=RefineParameters(coarse_iterations=3, fine_iterations=2),
+        verify=VerifyParameters(
+            min_score=0.0, min_support=0.15, min_support_blind=0.15, penalty_weight=0.0, alternatives=0
+        ),
+    ),
+}  # fmt: skip
+
+
+def find(
+    scans: Scan | Sequence[Scan],
+    models: ModelInput | Sequence[ModelInput],
+    *,
+    parameters: Parameters | None = None,
+    seed: int = 0,
+    jobs: int | None = None,
+    origin: ArrayLike | None = None,
+    units: str | None = None,
+    select: Sequence[str] = (),
+    progress: Progress | None = None,
+    isolate: bool = True,
+    remainder: CloudWriter | None = None,
+) -> Findings:
+    """Find every instance of every model in the scans, with no initial guess.
+
+        scans : files, (N, 3) float64 arrays in metres, or PointClouds; several are one scene
+        models : a ModelLibrary or its path, meshes, pieces of scan, or files of them
+        origin : (3,) where the scanner stood, for scans that do not say; with none, free space says nothing
+        units : of model files whose format has none; select : which models of an IFC file
+        progress : called with (stage, done, total), total -1 where nobody knows
+        isolate : cut each detection's raw points in a second pass
+        remainder : takes every point that belongs to no detection
+    Returns the detections, best first; poses in the scans' own frame, metres.
+
+    Raises ScanfindError: UsageError, UnreadableFileError, InvalidGeometryError, LibraryError …
+    """
+    parameters, jobs = parameters or PRESETS["default"], jobs or available_cores()
+    clock, tell = Clock(), progress or (lambda stage, done, total: None)
+    findings = Findings()
+
+    with clock("read"):
+        sources = Sources(scans, origin)
+    with clock("library"):
+        library = models_of(models, parameters, units, select)  # 3.2 model library: surface, pairs, hash table
+        table = joint_table(library)
+
+    with clock("grid"):  # 3.1, 3.3 scene representation: the weighted octree, in one pass
+        grid = MomentGrid(first_cell([model.diameter for model in library], parameters.grid))
+        for chunk in watched(sources.chunks(), clock, tell, "read", sources.expected()):
+            grid.add(chunk)
+        require_points(sources)
+        smallest = min(model.diameter for model in library)
+        scene = build_scene(
+            grid, smallest, parameters.grid, parameters.search.test_cells, parameters.search.reach_cells, jobs
+        )
+        del grid
+
+    found = Recognition(scene, library, table, parameters, seed, jobs)
+    while found.wants_more(clock.elapsed("search", "refine", "verify")):
+        tell("search", found.progress(), 1.0)
+        with clock("search"):
+            hypotheses = found.search.round()  # 3.3, 3.4 Algorithm 2: draw, look up, pose, count support
+        with clock("refine"):
+            poses = found.refine(hypotheses)  # 3.4 post-ICP
+        with clock("verify"):
+            found.believe(poses)  # support and penalty (Papazov & Burschka 2010), conflicts, self-similar poses
+    tell("search", 1.0, 1.0)
+
+    findings.extend(found.detections())
+    findings.refused = found.refused()
+    if isolate and (findings or remainder is not None):
+        with clock("isolate"):  # 3.5 isolation: the second pass
+            chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
+            tolerance = isolation_tolerance(parameters.isolate, found.noise(), scene.fine.cell)
+            findings.tolerance_m = tolerance
+            findings[:] = with_points(findings, library, chunks, tolerance, remainder)
+    findings.scans = [source.told() for source in sources.all]
+    findings.crs, findings.notes = sources.crs(), found.notes()
+    findings.shift = tuple(shift_for(scene.fine.offset).tolist())
+    findings.timings_s = clock.timings()
+    return findings
+
+
+def models_of(
+    models: ModelInput | Sequence[ModelInput], parameters: Parameters, units: str | None, select: Sequence[str]
+) -> list[Model]:
+    """The models sought, prepared: from a library as they are there, from files and meshes with these parameters."""
+    listed = [models] if isinstance(models, (ModelLibrary, Mesh, CloudModel, str, PathLike)) else list(models)
+    prepare = ModelParameters(parameters.surface, parameters.pairs)
+    sought: list[Model] = []
+    with ModelLibrary.in_memory() as fresh:
+        for given in listed:
+            if isinstance(given, ModelLibrary):
+                sought.extend(given.models())
+            elif isinstance(given, (Mesh, CloudModel)):
+                fresh.add(given, prepare)
+            elif is_library(given):
+                with ModelLibrary.open(Path(given)) as library:
+                    sought.extend(library.models())
+            else:
+                from scanfind.models import read_models
+
+                for model in read_models(Path(given), units=units, select=select):
+                    fresh.add(model, prepare)
+        sought.extend(fresh.models())
+    if not sought:
+        msg = "find: no model to look for: the library is empty; add one with `scanfind library add`"
+        raise UsageError(msg)
+    return sought
+
+
+def is_library(path: str | PathLike[str]) -> bool:
+    """Does a file begin as every SQLite file does?"""
+    try:
+        with Path(path).open("rb") as file:
+            return file.read(16) == b"SQLite format 3\0"
+    except OSError:
+        return False
+
+
+def isolation_tolerance(parameters: IsolationParameters, noise: float, cell: float) -> float:
+    """Within how many metres of a placed surface a raw point belongs to it."""
+    if parameters.tolerance_m is not None:
+        return parameters.tolerance_m
+    return min(max(parameters.noises * noise, 0.1 * cell), 0.5 * cell)
+
+
+def with_points(
+    findings: Sequence[Detection], library: Sequence[Model], chunks: Iterable[PointChunk], tolerance: float,
+    remainder: CloudWriter | None,
+) -> list[Detection]:  # fmt: skip
+    """Each detection with its raw points and how far they are from its model."""
+    surfaces = {
+        model.name: near_model(model, tolerance)
+        for model in library
+        if any(found.model == model.name for found in findings)
+    }
+    placed = [Placed(found.id, surfaces[found.model], found.scene_from_model) for found in findings]
+    rest = None if remainder is None else lambda chunk: write_rest(remainder, chunk)
+    points = isolate_raw(chunks, placed, IsolateParameters(tolerance), remainder=rest)
+    return [
+        found.with_points(cut := points[found.id], deviation_of(cut.deviation) if len(cut) else None)
+        for found in findings
+    ]
+
+
+def write_rest(writer: CloudWriter, chunk: PointChunk) -> None:
+    """Points of no detection, with where they came from."""
+    count = len(chunk)
+    scan_id = np.full(count, chunk.scan, np.int32)
+    writer.write(chunk.xyz, {**chunk.attributes, "scan_id": scan_id, "source_index": chunk.source_index})
+
+
+class Clock:
+    """Seconds by stage; a stage begun inside another stops the outer one's clock."""
+
+    def __init__(self) -> None:
+        self._began = self._since = time.perf_counter()
+        self._seconds = dict.fromkeys(STAGES, 0.0)
+        self._stack = ["total"]
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Charge the block's time to a stage."""
+        self._charge()
+        self._stack.append(stage)
+        try:
+            yield
+        finally:
+            self._charge()
+            self._stack.pop()
+
+    def _charge(self) -> None:
+        now = time.perf_counter()
+        self._seconds[self._stack[-1]] += now - self._since
+        self._since = now
+
+    def elapsed(self, *stages: str) -> float:
+        """Seconds charged to some stages so far."""
+        return sum(self._seconds[stage] for stage in stages)
+
+    def timings(self) -> dict[str, float]:
+        """Seconds by stage and in total."""
+        self._charge()
+        return {**self._seconds, "total": time.perf_counter() - self._began}
+
+
+def watched(
+    chunks: Iterator[PointChunk], clock: Clock, tell: Progress, stage: str, expected: int
+) -> Iterator[PointChunk]:
+    """The chunks; their reading charged to "read", their points told as progress of a stage."""
+    done = 0
+    while True:
+        with clock("read"):
+            chunk = next(chunks, None)
+        if chunk is None:
+            return
+        yield chunk
+        done += len(chunk) + chunk.dropped
+        tell(stage, done, expected)

@@ -1,0 +1,243 @@
+"""From hypotheses to detections: refine, weigh the evidence, settle who may claim which surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import log
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.detection import Detection, Motion, Refused
+from scanfind.pose import Pose
+from scanfind.refine import Refined, icp, shrinking, unobservable
+from scanfind.search import AREA_OF_A_SAMPLE, Hypotheses, Search, model_arrays
+from scanfind.symmetry import self_similar
+from scanfind.verify import Evidence, distinct, gather, score, why_refused
+
+if TYPE_CHECKING:
+    from scanfind.find import Parameters
+    from scanfind.library import JointTable
+    from scanfind.model import Model
+    from scanfind.scene import Scene
+
+Floats = NDArray[np.float64]
+
+REFUSED_SHOWN = 3  # of each model: what came closest
+
+
+class Candidate(NamedTuple):
+    """A refined pose with what the scene says of it.
+
+    rotation (3, 3), translation (3,) : scene_from_model, relative to the grid's offset; hessian (6, 6) : of ICP
+    score : 0 … 1; area : net supported surface, m², by which conflicting poses are ranked
+    """
+
+    model: int
+    rotation: Floats
+    translation: Floats
+    hessian: Floats
+    evidence: Evidence
+    score: float
+    area: float
+
+
+class Recognition:
+    """The state of one search: what is believed so far, what was refused and why."""
+
+    def __init__(
+        self, scene: Scene, models: Sequence[Model], table: JointTable, parameters: Parameters, seed: int, jobs: int
+    ) -> None:
+        self.scene, self.models, self.parameters, self.jobs = scene, models, parameters, jobs
+        self.arrays = model_arrays(models)
+        self.search = Search(scene, models, table, self.arrays, parameters.search, seed, jobs)
+        self.signed = scene.fine.signed and all(model.signed for model in models)
+        self.blind = not scene.depths
+        self.believed: list[Candidate] = []
+        self._refused: list[tuple[Candidate, str]] = []
+        self._ran_out_of_time = False
+        diameters = np.array([model.diameter for model in models])
+        # Poses closer than a thirtieth of the diameter meet in one ICP; after it a hundredth tells them apart.
+        self._apart_before, self._apart_after = diameters / 30.0, diameters / 100.0
+        self._similar: dict[int, list[Pose]] = {}
+
+    def wants_more(self, seconds: float) -> bool:
+        """Is another round worth it: time left, instances wanted, and the chance of having missed one too high?"""
+        limits = self.parameters.search
+        if limits.time_limit_s is not None and seconds >= limits.time_limit_s:
+            self._ran_out_of_time = limits.miss_probability > 0.0
+            return False
+        if limits.miss_probability <= 0.0:
+            return len(self.search.pool) > 1
+        enough = limits.max_instances is not None and len(self.believed) >= limits.max_instances
+        return not enough and not self.search.may_stop()
+
+    def progress(self) -> float:
+        """How far the search has come, 0 … 1: the log of the chance to have missed something, as against its limit."""
+        limit = self.parameters.search.miss_probability
+        if limit <= 0.0:
+            return 0.0
+        return min(1.0, log(max(self.search.chance_missed(), limit)) / log(limit))
+
+    def refine(self, hypotheses: Hypotheses) -> Refined:
+        """ICP of what is distinct among the hypotheses on the coarse surfels; of the best of those on the fine ones."""
+        refine, kept = self.parameters.refine, self.parameters.search.kept
+        first = hypotheses.take(distinct(hypotheses, self.arrays, self._apart_before, kept, 4 * kept))
+        rough = self._icp_coarse(first)
+        better = rough.hypotheses.take(np.argsort(-rough.matched, kind="stable"))
+        best = better.take(distinct(better, self.arrays, self._apart_after, kept // 3, kept))
+        return self._icp_fine(best, refine.fine_samples)
+
+    def _icp_coarse(self, hypotheses: Hypotheses) -> Refined:
+        refine, coarse = self.parameters.refine, self.scene.coarse
+        gates = shrinking(refine.coarse_gates, refine.coarse_iterations, coarse.cell)
+        return icp(
+            hypotheses,
+            coarse,
+            self.arrays,
+            self.signed,
+            gates,
+            refine.coarse_samples,
+            refine.normal_agreement,
+            self.jobs,
+        )
+
+    def _icp_fine(self, hypotheses: Hypotheses, samples: int) -> Refined:
+        refine, fine = self.parameters.refine, self.scene.fine
+        gates = shrinking(refine.fine_gates, refine.fine_iterations, fine.cell)
+        return icp(hypotheses, fine, self.arrays, self.signed, gates, samples, refine.normal_agreement, self.jobs)
+
+    def candidates(self, refined: Refined) -> list[Candidate]:
+        """Refined poses with their evidence."""
+        verify = self.parameters.verify
+        evidence = gather(refined.hypotheses, self.scene, self.arrays, self.signed, verify, self.jobs)
+        found = []
+        for k, seen in enumerate(evidence):
+            number = int(refined.hypotheses.models[k])
+            model = self.models[number]
+            net = seen.supported - verify.penalty_weight * seen.seen_through
+            found.append(
+                Candidate(
+                    number, refined.hypotheses.rotations[k], refined.hypotheses.translations[k], refined.hessians[k],
+                    seen, score(seen, self.blind, verify), net * AREA_OF_A_SAMPLE * model.spacing**2,
+                )
+            )  # fmt: skip
+        return found
+
+    def believe(self, refined: Refined) -> None:
+        """Accept what the evidence carries; of poses that claim one surface, the one that explains most of it.
+
+        Papazov & Burschka's conflict graph, solved greedily by the surface a pose explains.
+        """
+        verify, settled = self.parameters.verify, {id(candidate) for candidate in self.believed}
+        fresh = []
+        for candidate in self.candidates(refined):
+            reason = why_refused(candidate.evidence, self.blind, verify)
+            if reason:
+                self._refused.append((candidate, reason))
+            else:
+                fresh.append(candidate)
+        claimed, believed = np.zeros(len(self.scene.fine.means), np.bool_), []
+        for candidate in sorted([*self.believed, *fresh], key=lambda c: -c.area):
+            if self._shares(candidate, claimed):
+                self._refused.append((candidate, "another pose explains more of the same surface"))
+                continue
+            best = candidate if id(candidate) in settled else self._best_of_similar(candidate)
+            believed.append(best)
+            claimed[best.evidence.claims] = True
+        self.believed = believed
+        self._refused = closest(self._refused)
+        self.search.withdraw(np.flatnonzero(claimed))
+
+    def _shares(self, candidate: Candidate, claimed: NDArray[np.bool_]) -> bool:
+        """Is too much of what supports a pose claimed by others already?"""
+        claims = candidate.evidence.claims
+        return bool(claimed[claims].mean() > self.parameters.verify.shared) if len(claims) else True
+
+    def _best_of_similar(self, candidate: Candidate) -> Candidate:
+        """The best of a pose and those it could be taken for: the model turned over onto itself, each refined again."""
+        if not self.parameters.verify.alternatives:
+            return candidate
+        number = candidate.model
+        if number not in self._similar:
+            self._similar[number] = self_similar(self.models[number], self.parameters.verify.alternatives)
+        placed = Pose(candidate.rotation, candidate.translation)
+        others = [placed @ motion for motion in self._similar[number]]
+        if not others:
+            return candidate
+        count = len(others)
+        turned = Hypotheses(
+            np.full(count, number), np.array([p.rotation for p in others]), np.array([p.translation for p in others]),
+            np.ones(count),
+        )  # fmt: skip
+        refined = self._icp_fine(self._icp_coarse(turned).hypotheses, self.parameters.refine.fine_samples)
+        return max([candidate, *self.candidates(refined)], key=lambda c: c.area)
+
+    def detections(self) -> list[Detection]:
+        """What is believed, best first, numbered from 1, in the scans' own frame."""
+        ranked = sorted(self.believed, key=lambda c: (-round(c.score, 3), -c.area))[
+            : self.parameters.search.max_instances
+        ]
+        return [self._detection(number, candidate) for number, candidate in enumerate(ranked, start=1)]
+
+    def _detection(self, number: int, found: Candidate) -> Detection:
+        seen = found.evidence
+        return Detection(
+            id=number, model=self.models[found.model].name, scene_from_model=self._pose(found), score=found.score,
+            support=seen.support(), visible_support=seen.visible_support(), penalty=seen.penalty(),
+            coverage=seen.support(), rms_m=seen.rms, unobservable=self._unobservable(found),
+        )  # fmt: skip
+
+    def _pose(self, found: Candidate) -> Pose:
+        return Pose(found.rotation, found.translation + self.scene.fine.offset)
+
+    def _unobservable(self, found: Candidate) -> tuple[Motion, ...]:
+        """In the model's own axes."""
+        turn = np.zeros((6, 6))
+        turn[:3, :3] = turn[3:, 3:] = found.rotation
+        centre, radius = self.arrays.centres[found.model], float(self.arrays.radii[found.model])
+        return unobservable(turn.T @ found.hessian @ turn, centre, radius, self.parameters.refine.unobservable_below)
+
+    def refused(self) -> list[Refused]:
+        """What came closest of each model and why it was not believed."""
+        return [
+            Refused(
+                self.models[c.model].name, self._pose(c), c.score, c.evidence.support(), c.evidence.visible_support(),
+                c.evidence.penalty(), reason,
+            )
+            for c, reason in self._refused
+        ]  # fmt: skip
+
+    def noise(self) -> float:
+        """Spread of the raw points about the surfels that support what was found (or about all), metres."""
+        claims = [c.evidence.claims for c in self.believed]
+        flatness = self.scene.fine.flatness[np.concatenate(claims)] if claims else self.scene.fine.flatness
+        # The flatter quarter: edges and bends spread the points of a cell as well, and they are not noise.
+        return float(np.quantile(flatness, 0.25)) if len(flatness) else 0.0
+
+    def notes(self) -> list[str]:
+        """What a user should know about how far the answer may be trusted."""
+        told = []
+        if self.blind:
+            told.append("no scanner position is known, so free space says nothing: give --origin X,Y,Z if you know it")
+        if self.scene.unaddressable:
+            told.append(f"{self.scene.unaddressable} points lie too far from the rest and were left out")
+        if self._ran_out_of_time:
+            chance = self.search.chance_missed()
+            told.append(f"the time limit ended the search; an instance may have been missed with chance {chance:.0%}")
+        return told
+
+
+def closest(refused: list[tuple[Candidate, str]]) -> list[tuple[Candidate, str]]:
+    """The best few of each model by score, most convincing first; of poses at nearly one place only the best."""
+    kept: list[tuple[Candidate, str]] = []
+    for candidate, reason in sorted(refused, key=lambda pair: (-pair[0].score, -pair[0].area)):
+        same = [c for c, _ in kept if c.model == candidate.model]
+        if len(same) < REFUSED_SHOWN and all(
+            np.linalg.norm(c.translation - candidate.translation) > 1e-3
+            or np.abs(c.rotation - candidate.rotation).max() > 1e-3
+            for c in same
+        ):
+            kept.append((candidate, reason))
+    return kept

@@ -1,0 +1,106 @@
+"""Refinement: ICP of the model on the scene's surfels, and which motions the data do not fix (paper 3.4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.detection import Motion
+from scanfind.search import Hypotheses, ModelArrays
+from scanfind.threads import in_threads
+
+if TYPE_CHECKING:
+    from scanfind.surfels import Surfels
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RefineParameters:
+    """How poses are refined.
+
+    coarse_iterations, fine_iterations : ICP steps on the coarse and on the fine surfels (the paper: 5 in all)
+    coarse_samples, fine_samples : model samples used
+    coarse_gates, fine_gates : first and last gate of each, in cells of that level; shrinking geometrically between
+    normal_agreement : least cosine between a model's and a surfel's normal
+    unobservable_below : a motion is reported as not fixed by the data when its curvature is this share of the mean
+    """
+
+    coarse_iterations: int = 12
+    fine_iterations: int = 10
+    coarse_samples: int = 400
+    fine_samples: int = 3000
+    coarse_gates: tuple[float, float] = (1.5, 0.6)
+    fine_gates: tuple[float, float] = (1.2, 0.5)
+    normal_agreement: float = 0.7
+    unobservable_below: float = 0.004
+
+
+class Refined(NamedTuple):
+    """H refined poses: hessians (H, 6, 6) in (rotation × radius, translation), matched (H,) share, rms (H,) metres."""
+
+    hypotheses: Hypotheses
+    hessians: Floats
+    matched: Floats
+    rms: Floats
+
+
+def icp(
+    hypotheses: Hypotheses, surfels: Surfels, arrays: ModelArrays, signed: bool, gates: Floats, most_samples: int,
+    normal_agreement: float, jobs: int,
+) -> Refined:  # fmt: skip
+    """Point-to-plane ICP of each hypothesis, one step for each gate (metres, at most one cell of the surfels)."""
+    from scanfind.kernels.icp import refine_poses
+
+    count = len(hypotheses.models)
+    rotations, translations = hypotheses.rotations.copy(), hypotheses.translations.copy()
+    hessians, matched, rms = np.zeros((count, 6, 6)), np.zeros(count), np.full(count, np.inf)
+    in_threads(
+        jobs, count,
+        lambda start, stop: refine_poses(
+            start, stop, hypotheses.models, arrays.starts, arrays.points, arrays.normals, arrays.centres, arrays.radii,
+            most_samples, gates, normal_agreement, signed, surfels.cell, surfels.hash_keys, surfels.hash_values,
+            surfels.block_cells, surfels.first_surfel, surfels.means, surfels.normals,
+            rotations, translations, hessians, matched, rms,
+        ),
+    )  # fmt: skip
+    return Refined(hypotheses._replace(rotations=rotations, translations=translations), hessians, matched, rms)
+
+
+def shrinking(first_last: tuple[float, float], steps: int, cell: float) -> Floats:
+    """Gates from first to last, geometric, in metres."""
+    return cell * np.geomspace(*first_last, steps)
+
+
+def unobservable(hessian: Floats, centre: Floats, radius: float, below: float) -> tuple[Motion, ...]:
+    """The motions a refined pose may still make without the data noticing, in the model's frame.
+
+    hessian : (6, 6) in the model's axes, (rotation × radius, translation) about the centre
+    below : share of the mean curvature under which a motion counts as free
+    """
+    values, vectors = np.linalg.eigh(hessian)
+    mean = float(np.trace(hessian)) / 6.0
+    return tuple(motion_of(vectors[:, k], centre, radius) for k in range(6) if values[k] < below * mean or mean <= 0.0)
+
+
+def motion_of(vector: Floats, centre: Floats, radius: float) -> Motion:
+    """A six-vector (rotation × radius, translation) as the slide or roll it mostly is."""
+    turning, sliding = vector[:3] / radius, vector[3:]
+    if np.linalg.norm(vector[:3]) < np.linalg.norm(sliding):
+        return Motion("slide", triple(upright(sliding)), triple(centre))
+    # The line that a turn with this translation at the centre leaves where it is.
+    through = centre + np.cross(turning, sliding) / (turning @ turning)
+    return Motion("roll", triple(upright(turning)), triple(through))
+
+
+def upright(direction: Floats) -> Floats:
+    """Unit length; the largest part positive, since an axis has no sign."""
+    return np.asarray(direction / np.linalg.norm(direction) * np.sign(direction[np.argmax(np.abs(direction))]))
+
+
+def triple(vector: Floats) -> tuple[float, float, float]:
+    """Three plain floats."""
+    return float(vector[0]), float(vector[1]), float(vector[2])

@@ -1,0 +1,342 @@
+"""RANSAC over the scene: draw, look up, pose, test (paper 3.3 and 3.4, Algorithm 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import exp, log
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.pairs import rung_distance, rungs_of
+from scanfind.surfels import empty_hash
+from scanfind.threads import in_threads
+
+if TYPE_CHECKING:
+    from scanfind.library import JointTable
+    from scanfind.model import Model
+    from scanfind.scene import Scene
+
+Floats = NDArray[np.float64]
+
+# Poisson disks jam at 0.56 of the plane, not at the 0.91 of a hexagonal packing: a sample stands for 1.4 spacing².
+AREA_OF_A_SAMPLE = 1.4
+# Directions on the sphere a second point is sought in, drawn once: 0.4 MB stay in the cache, where a sine and a cosine
+# a try would cost more than the look-up they lead to.
+DIRECTIONS = 1 << 14
+# Bins a pair distance: a try takes any surfel of the bin a direction leads to (kernels.search.draw_pairs).
+BINS_A_DISTANCE = 6
+# Borders between classes of bend, in shares of the window: range noise of 2 mm on a plane is below the first for
+# windows over 0.1 m, a pipe as wide as the window above the last.
+BEND_BORDERS = (0.02, 0.05, 0.1)
+# A pair that lies on an instance finds it when noise left its feature in the right cell of the hash table and one of
+# the model's pairs there is near enough: measured 0.1 – 0.4 on shop scenes; the low end.
+RIGHT_PAIR_FINDS = 0.1
+
+
+@dataclass(frozen=True)
+class SearchParameters:
+    """How the search is carried out.
+
+    overlap_ratio : λs, the share of a model's samples that must lie on the scene (the paper: 0.15)
+    time_limit_s : seconds for search, verification and refinement together; None: until nothing is likely to be missed
+    miss_probability : stop when an instance that shows `overlap_ratio` of its surface has been missed with less than
+        this chance; 0: use all of the time limit, as the paper does
+    max_instances : stop after so many detections; None: all there are
+    pairs_a_round, hypotheses_a_round : scene pairs drawn before any is tested; hypotheses tested before any is refined
+    by_shape : draw points by the likelihood ratio of their local shape: how bent the surface around them is, on the
+        model as against in the scene; walls and floors are most of a scan and little of a spool
+    telling_first : test pairs first whose feature is rare in this scene: the chance of a pair to be right, over the
+        cost of testing it, is one over how often the scene shows its feature
+    normal_length_m : of the normals in the four-point sets (the paper: 1); 0: its limit, the roll alone from normals
+    max_tries : directions tried from s1 before another is drawn
+    tests : model samples in the sequential test
+    chance_overlap : share of samples of a wrong hypothesis that lie on the scene, for Wald's test
+    test_cells, reach_cells : cell of the test and how far a sample may be off along the normal, in fine cells
+    kept : hypotheses refined each round, for each model
+    """
+
+    overlap_ratio: float = 0.25
+    time_limit_s: float | None = 60.0
+    miss_probability: float = 0.01
+    max_instances: int | None = None
+    pairs_a_round: int = 50_000
+    hypotheses_a_round: int = 400_000
+    by_shape: bool = True
+    telling_first: bool = True
+    normal_length_m: float = 0.0
+    max_tries: int = 1000
+    tests: int = 192
+    chance_overlap: float = 0.1
+    test_cells: float = 4.0
+    reach_cells: float = 2.0
+    kept: int = 48
+
+
+class ModelArrays(NamedTuple):
+    """The samples of all models sought, end to end.
+
+    starts : (models+1,) int64; points, normals : (N, 3); centres (models, 3), radii (models,) : of the samples, metres
+    """
+
+    starts: NDArray[np.int64]
+    points: Floats
+    normals: Floats
+    centres: Floats
+    radii: Floats
+
+
+class Hypotheses(NamedTuple):
+    """H poses of models, the best first.
+
+    models : (H,) int64; rotations (H, 3, 3), translations (H, 3) : scene_from_model, relative to the grid's offset
+    support : (H,) share of the test's samples on the scene
+    """
+
+    models: NDArray[np.int64]
+    rotations: Floats
+    translations: Floats
+    support: Floats
+
+    def take(self, which: NDArray[np.intp]) -> Hypotheses:
+        """Some of them."""
+        return Hypotheses(self.models[which], self.rotations[which], self.translations[which], self.support[which])
+
+
+def model_arrays(models: Sequence[Model]) -> ModelArrays:
+    """Concatenate the models' samples."""
+    sizes = [len(model.samples) for model in models]
+    centres = np.array([model.samples.points.mean(axis=0) for model in models])
+    radii = np.array(
+        [
+            np.sqrt(((m.samples.points - centre) ** 2).sum(axis=1).mean())
+            for m, centre in zip(models, centres, strict=True)
+        ]
+    )
+    return ModelArrays(
+        np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+        np.concatenate([m.samples.points for m in models]),
+        np.concatenate([m.samples.normals for m in models]),
+        centres, radii,
+    )  # fmt: skip
+
+
+def wald_table(tests: int, right: float, wrong: float, lost: float = 0.02) -> NDArray[np.int64]:
+    """Least hits after k = 0 … tests samples below which a hypothesis is given up (Wald's sequential test).
+
+    right, wrong : chance of a sample to lie on the scene under a right and a wrong hypothesis; lost : accepted chance
+    of giving up a right one.
+    """
+    right = max(right, 1.5 * wrong)
+    hit, miss = log(right / wrong), log((1.0 - right) / (1.0 - wrong))
+    k = np.arange(tests + 1)
+    least = np.ceil((log(lost) - k * miss) / (hit - miss)).clip(0)
+    # What is left at the end must have the overlap itself, less what chance does to a sample of this size.
+    least[-1] = max(least[-1], np.floor(tests * right - 2.0 * np.sqrt(tests * right * (1.0 - right))))
+    return np.asarray(least, np.int64)
+
+
+class Search:
+    """The rounds of RANSAC over one scene, for all models together; the same seed gives the same rounds."""
+
+    def __init__(
+        self, scene: Scene, models: Sequence[Model], table: JointTable, arrays: ModelArrays,
+        parameters: SearchParameters, seed: int, jobs: int,
+    ) -> None:  # fmt: skip
+        self.scene, self.models, self.table, self.arrays = scene, models, table, arrays
+        self.parameters, self.seed, self.jobs = parameters, seed, jobs
+        self.pairs = models[0].parameters.pairs
+        self.rungs = sorted({rung for m in models for rung in rungs_of(m.diameter, m.parameters.pairs)}, reverse=True)
+        self._classes = shape_classes(scene.bends, scene.window)
+        self._classes[~scene.fine.has_normal()] = -1
+        self.model_shapes = np.array([model_shape(model, scene.window) for model in models])
+        # As far as two samples of a model may be off, but never less than the scene's own resampling.
+        self._tolerance = max(scene.fine.cell, self.pairs.tolerance * min(model.spacing for model in models))
+        self.pool = np.empty(0, np.intp)
+        self.done = np.zeros(len(models), np.bool_)
+        self._fill_pool()
+        way = np.random.default_rng(seed).standard_normal((DIRECTIONS, 3))
+        self._directions = way / np.linalg.norm(way, axis=1)[:, None]
+        self.rounds = 0
+        self.drawn = self.tested = self.hypotheses = self.lookups = 0
+        self._expected = np.zeros(len(models))
+        self._unsigned = not (scene.fine.signed and all(m.signed for m in models))
+        # A right hypothesis puts λs of its samples on the scene, and chance some of the others.
+        wanted = parameters.overlap_ratio
+        right = wanted + (1.0 - wanted) * parameters.chance_overlap
+        self._least_hits = wald_table(parameters.tests, right, parameters.chance_overlap)
+
+    def withdraw(self, surfels: NDArray[np.intp]) -> None:
+        """Draw no more from surfels that are explained."""
+        self._classes[surfels] = -1
+        self._fill_pool()
+
+    def _fill_pool(self) -> None:
+        """Choose the surfels that may be drawn: each with a chance by the likelihood ratio of its shape."""
+        counts = np.bincount(self._classes[self._classes >= 0], minlength=len(BEND_BORDERS) + 1)
+        ratio = np.where(counts > 0, self.model_shapes.mean(axis=0) / np.maximum(counts, 1), 0.0)
+        self._kept = np.minimum(1.0, ratio / max(ratio.max(), 1e-300)) if self.parameters.by_shape else counts > 0
+        chance = np.append(self._kept, 0.0)[self._classes]  # class -1, the last, is never drawn
+        luck = np.random.default_rng([self.seed, len(self.pool)]).random(len(chance))
+        self.pool = np.flatnonzero(luck < chance)
+        self._bins = {
+            rung: bin_pool(self.pool, self.scene.fine.means, rung_distance(rung, self.pairs) / BINS_A_DISTANCE)
+            for rung in self.rungs
+        }
+
+    def may_stop(self) -> bool:
+        """Has an instance of any model still sought been missed with less than the chance allowed?"""
+        return len(self.pool) < 2 or self.chance_missed() < self.parameters.miss_probability
+
+    def chance_missed(self) -> float:
+        """Chance to have missed an instance that shows λs of its surface, for the model worst served so far."""
+        left = self._expected[~self.done]
+        return exp(-float(left.min())) if len(left) else 0.0
+
+    def round(self) -> Hypotheses:
+        """One round: draw pairs, look them up, test their hypotheses; the best of each pair that pass, best first."""
+        from scanfind.kernels.search import test_pairs
+
+        first, second, signs, keys = self._telling_pairs()
+        count = len(first)
+        hits, models = np.zeros(count, np.int64), np.zeros(count, np.int64)
+        rotations, translations = np.empty((count, 3, 3)), np.empty((count, 3))
+        fine, tolerant, table, arrays = self.scene.fine, self.scene.tolerant, self.table, self.arrays
+
+        def test(start: int, stop: int) -> NDArray[np.int64]:
+            work = np.zeros(2, np.int64)
+            test_pairs(
+                start, stop, first, second, signs, keys, fine.means, fine.normals,
+                table.offsets, table.model, table.first, table.second, arrays.starts, arrays.points, arrays.normals,
+                self.done, self.parameters.normal_length_m, tolerant.cell, tolerant.hash_keys, tolerant.hash_values,
+                tolerant.masks, self._least_hits, hits, models, rotations, translations, work,
+            )  # fmt: skip
+            return work
+
+        work = np.sum(in_threads(self.jobs, count, test) or [np.zeros(2, np.int64)], axis=0)
+        self.hypotheses += int(work[0])
+        self.lookups += int(work[1])
+        self.tested += count
+        self.rounds += 1
+        order = np.argsort(-hits, kind="stable")[: np.count_nonzero(hits)]
+        return Hypotheses(models[order], rotations[order], translations[order], hits[order] / self.parameters.tests)
+
+    def _telling_pairs(self) -> tuple[NDArray[np.int64], ...]:
+        """Draw a round's pairs; of those the library knows, the most telling that the round can afford to test."""
+        columns = [self._draw(rung) for rung in self.rungs]
+        first, second, signs, keys = (np.concatenate(column) for column in zip(*columns, strict=True))
+        cost = (self.table.offsets[1:] - self.table.offsets[:-1])[keys]
+        known = cost > 0
+        common = np.bincount(keys, minlength=len(self.table.offsets) - 1)
+        order = np.flatnonzero(known)
+        if self.parameters.telling_first:
+            order = order[np.argsort(common[keys[order]], kind="stable")]
+        affordable = np.searchsorted(np.cumsum(cost[order]), self.parameters.hypotheses_a_round) + 1
+        order = order[:affordable]
+        self._expect(keys, keys[order])
+        return first[order], second[order], signs[order], keys[order]
+
+    def _draw(self, rung: int) -> tuple[NDArray[np.int64], ...]:
+        """Pairs of scene points at one rung's distance: first, second, signs, keys, those that met a second point."""
+        from scanfind.kernels.search import draw_pairs, key_pairs
+
+        fine, count = self.scene.fine, self.parameters.pairs_a_round // len(self.rungs)
+        first, second = np.empty(count, np.int64), np.empty(count, np.int64)
+        bins, distance = self._bins[rung], rung_distance(rung, self.pairs)
+        in_threads(
+            self.jobs, count,
+            lambda start, stop: draw_pairs(
+                start, stop, self.seed, self.rounds * 1024 + rung, bins.pool, bins.edge, bins.hash_keys,
+                bins.hash_values, bins.starts, fine.means, self._directions, distance, self._tolerance,
+                self.parameters.max_tries, first, second,
+            ),
+        )  # fmt: skip
+        self.drawn += count
+        met = second >= 0
+        first, second = first[met], second[met]
+        # Where nobody knows a normal's side, each pair is looked up with all four choices of sides.
+        sides = 4 if self._unsigned else 1
+        signs = np.repeat(np.arange(sides), len(first))
+        first, second = np.tile(first, sides), np.tile(second, sides)
+        keys = np.empty(len(first), np.int64)
+        key_pairs(
+            first, second, signs, fine.means, fine.normals, self.pairs.angle_cell(), self.pairs.angle_bins(), keys
+        )
+        keys += rung * self.pairs.cells_per_rung()
+        return first, second, signs, keys
+
+    def _expect(self, drawn: NDArray[np.int64], tested: NDArray[np.int64]) -> None:
+        """Add how many right pairs this round tested of an instance of each model that shows `overlap_ratio`."""
+        cells, fine, shown = len(self.table.offsets) - 1, self.scene.fine, self.parameters.overlap_ratio
+        share = np.bincount(tested, minlength=cells) / np.maximum(np.bincount(drawn, minlength=cells), 1)
+        for number, model in enumerate(self.models):
+            samples, rung_of_pair = len(model.samples), model.pairs.keys // self.pairs.cells_per_rung()
+            area = AREA_OF_A_SAMPLE * samples * model.spacing**2
+            # What of an instance that shows λs of its surface would be in the pool.
+            on_it = shown * area / fine.cell**2 * float((self.model_shapes[number] * self._kept).sum())
+            first_on_it = min(1.0, on_it / max(len(self.pool), 1))
+            for rung in rungs_of(model.diameter, model.parameters.pairs):
+                keys = model.pairs.keys[rung_of_pair == rung]
+                if not len(keys):
+                    continue
+                # The share of its samples a pair's length away, as against all of the pool so far away.
+                shell = 2.0 * model.parameters.pairs.tolerance * model.spacing
+                partners = on_it * len(keys) / samples**2 * 2.0 * self._tolerance / shell
+                second_on_it = partners / max(self._partners(rung), partners, 1e-9)
+                drawn_here = self.parameters.pairs_a_round / len(self.rungs)
+                right = drawn_here * first_on_it * second_on_it * float(share[keys].mean())
+                self._expected[number] += RIGHT_PAIR_FINDS * right
+
+    def _partners(self, rung: int) -> float:
+        """How many surfels of the pool lie at a rung's distance from one of them, on average."""
+        from scanfind.kernels.search import count_partners
+
+        bins = self._bins[rung]
+        if bins.partners < 0.0:
+            some = self.pool[:: max(1, len(self.pool) // 100)]
+            found = count_partners(
+                some, self.pool, self.scene.fine.means, rung_distance(rung, self.pairs), self._tolerance
+            )
+            self._bins[rung] = bins = bins._replace(partners=float(found))
+        return bins.partners
+
+
+class Bins(NamedTuple):
+    """The pool sorted into cubes of one edge, metres: bin b holds pool[starts[b]:starts[b+1]]; partners: see Search."""
+
+    edge: float
+    pool: NDArray[np.intp]
+    hash_keys: NDArray[np.int64]
+    hash_values: NDArray[np.int32]
+    starts: NDArray[np.int64]
+    partners: float
+
+
+def bin_pool(pool: NDArray[np.intp], means: Floats, edge: float) -> Bins:
+    """Sort surfels into cubes of an edge in metres."""
+    from scanfind.kernels.blocks import BIAS, fill_hash
+
+    x, y, z = (np.floor(means[pool] / edge).astype(np.int64) + BIAS).T
+    keys = (x << 43) | (y << 23) | (z << 3)
+    order = np.argsort(keys, kind="stable")
+    bins, starts = np.unique(keys[order], return_index=True)
+    hash_keys, hash_values = empty_hash(len(bins))
+    fill_hash(bins, hash_keys, hash_values)
+    return Bins(edge, pool[order], hash_keys, hash_values, np.append(starts, len(pool)), -1.0)
+
+
+def shape_classes(bends: Floats, window: float) -> NDArray[np.int8]:
+    """Class of each point by how bent the surface in the window around it is, (S,)."""
+    return np.digitize(bends, np.array(BEND_BORDERS) * window).astype(np.int8)
+
+
+def model_shape(model: Model, window: float) -> Floats:
+    """Share of a model's samples in each class, (C,); none is quite zero: scan and model are not sampled alike."""
+    from scanfind.kernels.shape import bend_of_samples
+
+    bends = np.empty(len(model.samples))
+    bend_of_samples(model.samples.points, model.samples.normals, window, bends)
+    shares = np.bincount(shape_classes(bends, window), minlength=len(BEND_BORDERS) + 1) / len(bends)
+    return np.asarray((shares + 0.02) / (shares + 0.02).sum())

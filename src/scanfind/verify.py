@@ -1,0 +1,172 @@
+"""Verification: what the whole scene says of a refined pose, and which of several poses may claim a surface.
+
+Support is the paper's λs = ms/m (3.4); penalty is Papazov & Burschka's (2010): samples a beam has passed through. A
+sample hidden behind something is no evidence at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.threads import in_threads
+
+if TYPE_CHECKING:
+    from scanfind.scene import Scene
+    from scanfind.search import Hypotheses, ModelArrays
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class VerifyParameters:
+    """When a pose is believed.
+
+    min_score : least score of a detection
+    min_support : least share of samples on the scene
+    min_support_blind : the same where no scanner position is known and free space can say nothing
+    gate_cells, inlier_cells : a sample is supported by a surfel this near whose plane it meets this closely, in cells
+    normal_agreement : least cosine between a sample's and its surfel's normal
+    margin_cells : a beam passed through a sample if it went on so far behind it, in cells
+    least_facing : cosine to the beam below which a surface may return nothing
+    penalty_weight : how much a sample seen through counts against one supported; 0: the paper, which looks at support
+    shared : share of its support a detection may have in common with a better one
+    alternatives : how many poses a model could be mistaken for, by its own symmetry, are tried against the best
+    """
+
+    min_score: float = 0.85
+    min_support: float = 0.1
+    min_support_blind: float = 0.35
+    gate_cells: float = 1.0
+    inlier_cells: float = 0.5
+    normal_agreement: float = 0.8
+    margin_cells: float = 2.5
+    least_facing: float = 0.25
+    penalty_weight: float = 1.0
+    shared: float = 0.5
+    alternatives: int = 24
+
+
+# Share of a model's surface that scans from a few sides show: full marks where nothing tells hidden from missing.
+EXPECTED_BLIND = 0.5
+BELIEVED_SUPPORT = 0.05
+
+
+class Evidence(NamedTuple):
+    """What the scene says of the samples of one pose.
+
+    samples : N; supported, seen_through, hidden : how many of them
+    rms : of the supported samples' distances to the scene, metres
+    claims : surfels that support it, ascending
+    """
+
+    samples: int
+    supported: int
+    seen_through: int
+    hidden: int
+    rms: float
+    claims: NDArray[np.intp]
+
+    def support(self) -> float:
+        """The paper's λs."""
+        return self.supported / self.samples
+
+    def penalty(self) -> float:
+        """Papazov & Burschka's share of samples that occlude what was seen behind them."""
+        return self.seen_through / self.samples
+
+    def visible_support(self) -> float:
+        """Share of the samples the scanners could speak of that are there."""
+        spoken = self.supported + self.seen_through
+        return self.supported / spoken if spoken else 0.0
+
+
+def score(evidence: Evidence, blind: bool, parameters: VerifyParameters) -> float:
+    """0 … 1: the share of the looked-at surface that is there, less the weighted share that is not (Papazov 2010).
+
+    blind : no scanner position is known; then only support speaks, and half the surface is all that is expected of it
+    """
+    if blind:
+        return min(1.0, evidence.support() / EXPECTED_BLIND)
+    spoken = evidence.supported + parameters.penalty_weight * evidence.seen_through
+    visible = evidence.supported / spoken if spoken else 0.0
+    # Few supported samples can agree by chance: the visible share is believed as far as their number goes.
+    return visible * float(1.0 - np.exp(-evidence.support() / BELIEVED_SUPPORT))
+
+
+def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters) -> str:
+    """Why a pose is not believed, in words; empty where it is."""
+    least = parameters.min_support_blind if blind else parameters.min_support
+    if evidence.support() < least:
+        return f"only {evidence.support():.0%} of its surface lies on the scan, {least:.0%} is asked for"
+    if score(evidence, blind, parameters) < parameters.min_score:
+        if blind:
+            return f"{evidence.support():.0%} of its surface lies on the scan, and no free space is known to tell more"
+        share = 1.0 - evidence.visible_support()
+        return f"beams passed through {share:.0%} of the surface that scanners should have seen"
+    return ""
+
+
+def gather(
+    hypotheses: Hypotheses, scene: Scene, arrays: ModelArrays, signed: bool, parameters: VerifyParameters, jobs: int
+) -> list[Evidence]:
+    """The evidence of each of H hypotheses."""
+    from scanfind.kernels.evidence import HIDDEN, SEEN_THROUGH, SUPPORTED, gather_evidence
+
+    sizes = (arrays.starts[1:] - arrays.starts[:-1])[hypotheses.models]
+    ends = np.cumsum(sizes)
+    total = int(ends[-1]) if len(ends) else 0
+    states, residuals, claims = np.empty(total, np.uint8), np.empty(total, np.float32), np.empty(total, np.int32)
+    fine = scene.fine
+    origins, ranges = scene.origins(), scene.ranges()
+    edge = scene.depths[0].edge if scene.depths else 1
+    in_threads(
+        jobs, len(sizes),
+        lambda start, stop: gather_evidence(
+            start, stop, hypotheses.models, arrays.starts, arrays.points, arrays.normals, hypotheses.rotations,
+            hypotheses.translations, parameters.gate_cells * fine.cell, parameters.inlier_cells * fine.cell,
+            parameters.normal_agreement, signed, fine.cell, fine.hash_keys, fine.hash_values, fine.block_cells,
+            fine.first_surfel, fine.means, fine.normals, origins, ranges, edge, parameters.margin_cells * fine.cell,
+            parameters.least_facing, ends - sizes, states, residuals, claims,
+        ),
+    )  # fmt: skip
+    found = []
+    for start, stop in zip(ends - sizes, ends, strict=True):
+        state, claim = states[start:stop], claims[start:stop]
+        on = state == SUPPORTED
+        squares = residuals[start:stop][on].astype(np.float64) ** 2
+        found.append(
+            Evidence(
+                int(stop - start), int(on.sum()), int((state == SEEN_THROUGH).sum()), int((state == HIDDEN).sum()),
+                float(np.sqrt(squares.mean())) if len(squares) else float("inf"), np.unique(claim[on]).astype(np.intp),
+            )
+        )  # fmt: skip
+    return found
+
+
+def distinct(hypotheses: Hypotheses, arrays: ModelArrays, apart: Floats, most: int, in_all: int) -> NDArray[np.intp]:
+    """The first of each group of poses that nearly coincide (indices), at most `most` of each model and `in_all`.
+
+        apart : (models,) metres; poses that move no point of the model's outline farther than this are one
+
+    Thousands of poses that roll about a straight pipe pass the sequential test; one of each group is refined.
+    """
+    corners = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    kept: list[int] = []
+    outlines: dict[int, list[Floats]] = {}
+    for k, model in enumerate(hypotheses.models.tolist()):
+        if len(kept) >= in_all:
+            break
+        near = outlines.setdefault(model, [])
+        if len(near) >= most:
+            continue
+        points = arrays.centres[model] + arrays.radii[model] * corners
+        outline = points @ hypotheses.rotations[k].T + hypotheses.translations[k]
+        if near and (np.linalg.norm(np.array(near) - outline, axis=2).max(axis=1) < apart[model]).any():
+            continue
+        near.append(outline)
+        kept.append(k)
+    return np.array(kept, np.intp)
