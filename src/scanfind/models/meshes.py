@@ -22,6 +22,8 @@ def read(path: Path, wanted: Wanted) -> list[Mesh]:
     if found < triangles:
         msg = f"{path} is cut short: {found} of {triangles} faces could be read"
         raise UnreadableFileError(msg)
+    if len(parts) == 1:
+        parts = [parts[0]._replace(name=path.stem)]  # the name trimesh makes up for it says nothing
     return [join(path.stem, parts, str(path), wanted.scale)]
 
 

@@ -27,6 +27,9 @@ class Part(NamedTuple):
 # An assembly of more is a list of triangles by another name, and facing each outwards by itself would take minutes.
 MOST_PARTS = 10_000
 
+# Beyond any site on Earth by a hundred times; what is welded at 1e-8 m still fits into 64 bits.
+FARTHEST_M = 1e9
+
 
 def join(name: str, parts: Iterable[Part], source: str, scale: float = 1.0) -> Mesh:
     """One mesh of all the parts: a CAD assembly is one object.
@@ -34,7 +37,8 @@ def join(name: str, parts: Iterable[Part], source: str, scale: float = 1.0) -> M
     scale : metres in one of the parts' units
 
     Its notes: `parts`, ((name, first face, face after the last), …); `watertight`, whether every part is; `turned`, how
-    many parts came inside out. Raises InvalidGeometryError as `Mesh.of` does, and where there is no triangle at all.
+    many parts came inside out. Raises InvalidGeometryError for vertices or faces that cannot be, and where no triangle
+    has an area.
     """
     parts = list(parts)
     if len(parts) > MOST_PARTS:
@@ -42,13 +46,12 @@ def join(name: str, parts: Iterable[Part], source: str, scale: float = 1.0) -> M
     vertices, faces, bounds, closed, turned = [], [], [], [], 0
     first_vertex = first_face = 0
     for part in parts:
+        _check(part, source or name, FARTHEST_M / scale)
         try:
             mesh = Mesh.of(part.name, part.vertices * scale, part.faces)
         except InvalidGeometryError:
             # A part without area (a weld line, a construction plane of no width) is no reason to refuse the others.
-            if np.isfinite(part.vertices).all() and _names_its_vertices(part):
-                continue
-            raise
+            continue
         welded, watertight, inverted = _faced_outwards(mesh)
         vertices.append(welded.vertices)
         faces.append(welded.faces.astype(np.int64) + first_vertex)
@@ -78,8 +81,14 @@ def as_one(parts: Sequence[Part]) -> Part:
     return Part(parts[0].name, np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
 
 
-def _names_its_vertices(part: Part) -> bool:
-    return not part.faces.size or bool(part.faces.min() >= 0 and part.faces.max() < len(part.vertices))
+def _check(part: Part, source: str, farthest: float) -> None:
+    """That coordinates are numbers, of a size that can be squared and welded, and that faces name them."""
+    if not (np.abs(part.vertices) <= farthest).all():
+        msg = f"{source} has coordinates that are not numbers, or beyond {FARTHEST_M:g} m: damaged, or of other units"
+        raise InvalidGeometryError(msg)
+    if part.faces.size and (part.faces.min() < 0 or part.faces.max() >= len(part.vertices)):
+        msg = f"{source} has faces that name vertices it does not have: damaged"
+        raise InvalidGeometryError(msg)
 
 
 def _faced_outwards(mesh: Mesh) -> tuple[Mesh, bool, bool]:

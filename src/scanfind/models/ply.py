@@ -68,7 +68,10 @@ def read(path: Path, wanted: Wanted) -> list[Mesh | CloudModel]:
             msg = "it has faces that name vertices it does not have"
             raise ValueError(msg)
         faces = fans(corners, counts)
-    except (ValueError, IndexError, KeyError) as error:
+    except KeyError as error:
+        msg = f"{path} is not a readable PLY file: its header has the word {error}, which PLY does not know"
+        raise UnreadableFileError(msg) from None
+    except (ValueError, IndexError, OverflowError) as error:
         msg = f"{path} is not a readable PLY file: {error}"
         raise UnreadableFileError(msg) from None
     return [join(path.stem, [Part(path.stem, vertices, faces)], str(path), wanted.scale)]
