@@ -144,6 +144,8 @@ class Recognition:
                 self._refused.append((candidate, "another pose explains more of the same surface"))
                 continue
             best = candidate if id(candidate) in settled else self._best_of_similar(candidate)
+            if best is not candidate and self._shares(best, claimed):
+                continue  # turned over, it is one we have
             believed.append(best)
             claimed[best.evidence.claims] = True
         self.believed = believed
