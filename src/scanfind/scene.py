@@ -57,7 +57,8 @@ class Scene:
 
     def ranges(self) -> NDArray[np.float32]:
         """Depth maps, (K, 6·edge²)."""
-        return np.array([depth.ranges for depth in self.depths], np.float32).reshape(len(self.depths), -1)
+        edge = self.depths[0].edge if self.depths else 1
+        return np.array([depth.ranges for depth in self.depths], np.float32).reshape(-1, 6 * edge**2)
 
 
 def first_cell(diameters: Iterable[float], parameters: GridParameters) -> float:
