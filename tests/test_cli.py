@@ -15,6 +15,7 @@ from scanfind.cli import main
 from scanfind.cli.tables import table, turned
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose
+from scanfind.results import read_results
 from scanfind.scans import open_writer, read_scan
 from scanfind.simulate.objects import pipe_spool
 from scanfind.simulate.scanner import scan
@@ -47,6 +48,11 @@ def shop(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _points(path: Path) -> int:
     return sum(len(chunk) for chunk in read_scan(path))
+
+
+def _files(found: Path) -> dict[str, bytes]:
+    """The point clouds of a result folder."""
+    return {path.name: path.read_bytes() for path in [*found.glob("points/*"), found / "remainder.ply"]}
 
 
 def _find(shop: Path, *more: str, model: str = "spool.stl") -> int:
@@ -145,14 +151,22 @@ def test_a_config_file_and_the_environment_are_heard(
 
 @pytest.mark.slow
 def test_points_are_cut_again_without_searching(shop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = tmp_path / "found"
-    assert _find(shop, "--out", str(found), "--tolerance", "0.01") == 0
-    first = json.loads((found / "results.json").read_text())
-    assert main(["isolate", str(found), str(shop / "scan.ply"), "--tolerance", "0.003"]) == 0
-    second = json.loads((found / "results.json").read_text())
-    assert [d["scene_from_model"] for d in second["detections"]] == [d["scene_from_model"] for d in first["detections"]]
-    assert 0 < second["detections"][0]["points"] <= first["detections"][0]["points"]
-    assert second["models"] == first["models"]
+    found, scan_file = tmp_path / "found", str(shop / "scan.ply")
+    assert _find(shop, "--out", str(found), "--remainder") == 0
+    first = read_results(found)
+    points = _files(found)
+    assert main(["isolate", str(found), scan_file]) == 0
+    same = read_results(found)
+    told_anew = {"timings_s": same.timings_s, "peak_memory_bytes": same.peak_memory_bytes}
+    assert same == first.model_copy(update=told_anew)
+    assert _files(found) == points
+
+    other = tmp_path / "other"
+    assert main(["isolate", str(found), scan_file, "--tolerance", "0.001", "--out", str(other), "--format", "laz"]) == 0
+    less = read_results(other)
+    assert 0 < less.detections[0].points < first.detections[0].points
+    assert less.detections[0].points + _points(other / "remainder.ply") == _points(shop / "scan.ply")
+    assert _files(found) == points
     capsys.readouterr()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,7 +56,11 @@ def isolate_again(
             findings = Findings(with_points(found, models.models(), chunks, within, rest))
         findings.refused, findings.notes = found.refused, found.notes
         findings.shift, findings.crs, findings.tolerance_m = found.shift, found.crs, within
-        findings.scans, findings.timings_s = [source.told() for source in sources.all], clock.timings()
+        # Where the scanner stood may have been told to the search by hand.
+        stood = {scan.path: scan.stations for scan in found.scans}
+        told = [source.told() for source in sources.all]
+        findings.scans = [replace(scan, stations=stood.get(scan.path, scan.stations)) for scan in told]
+        findings.timings_s = clock.timings()
         return fill_folder(
             folder, findings, models=models, sought=before.models, parameters=before.parameters, seed=before.seed,
             format=format, remainder=before.remainder, progress=progress,
