@@ -130,9 +130,7 @@ def find(
             grid.add(chunk)
         require_points(sources)
         smallest = min(model.diameter for model in library)
-        scene = build_scene(
-            grid, smallest, parameters.grid, parameters.search.test_cells, parameters.search.reach_cells, jobs
-        )
+        scene = build_scene(grid, smallest, parameters.grid, parameters.search.test_cells_across, jobs)
         del grid
 
     found = Recognition(scene, library, table, parameters, seed, jobs)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scanfind.detection import Detection, Motion, Refused
 from scanfind.pose import Pose
 from scanfind.refine import Refined, icp, shrinking, unobservable
+from scanfind.scene import quiet
 from scanfind.search import AREA_OF_A_SAMPLE, Hypotheses, Search, model_arrays
 from scanfind.symmetry import self_similar
 from scanfind.verify import Evidence, distinct, gather, score, why_refused
@@ -215,8 +216,7 @@ class Recognition:
         """Spread of the raw points about the surfels that support what was found (or about all), metres."""
         claims = [c.evidence.claims for c in self.believed]
         flatness = self.scene.fine.flatness[np.concatenate(claims)] if claims else self.scene.fine.flatness
-        # The flatter quarter: edges and bends spread the points of a cell as well, and they are not noise.
-        return float(np.quantile(flatness, 0.25)) if len(flatness) else 0.0
+        return quiet(flatness)
 
     def notes(self) -> list[str]:
         """What a user should know about how far the answer may be trusted."""

@@ -21,12 +21,14 @@ class OrientationGrid(NamedTuple):
 
     cell : edge, metres
     hash_keys, hash_values : packed block coordinates → block
+    occupied : (B, 8) uint64, a bit for each of the block's 512 cells that is marked at all
     masks : (B, 512) uint64, a bit for each of 54 directions (kernels.search.normal_bit)
     """
 
     cell: float
     hash_keys: NDArray[np.int64]
     hash_values: NDArray[np.int32]
+    occupied: NDArray[np.uint64]
     masks: NDArray[np.uint64]
 
 
@@ -39,6 +41,7 @@ class Scene:
     bends : (S,) for each fine surfel, standard deviation across the plane of the `window` around it, metres
     window : edge of that cube, metres
     depths : what each known scanner position saw; empty where none is known
+    noise : spread of raw points across the flatter quarter of the surfels: the scanner's noise, metres
     points, unaddressable : raw points in the grid, and those too far from the rest to be
     """
 
@@ -48,6 +51,7 @@ class Scene:
     bends: Floats
     window: float
     depths: list[DepthMap]
+    noise: float
     points: int
     unaddressable: int
 
@@ -69,13 +73,13 @@ def first_cell(diameters: Iterable[float], parameters: GridParameters) -> float:
 
 
 def build_scene(
-    grid: MomentGrid, diameter: float, parameters: GridParameters, test_cells: float, reach_cells: float, jobs: int
+    grid: MomentGrid, diameter: float, parameters: GridParameters, test_cells_across: float, jobs: int
 ) -> Scene:
     """Resample a filled grid (paper 3.1), doubling its cells until the scan fills them.
 
     diameter : of the smallest model sought, metres
-    test_cells : edge of the sequential test's cells, in fine cells
-    reach_cells : how far along its normal a surfel tolerates a sample in that test, in fine cells
+    test_cells_across : cells of the sequential test along that diameter; a surfel tolerates a sample that is half of
+        one off along its normal
     """
     largest_cell = diameter / parameters.least_cells_across
     if parameters.cell_m is None:
@@ -85,9 +89,25 @@ def build_scene(
     fine = grid.surfels(parameters.min_neighbours, jobs)
     coarse = half.surfels(parameters.min_neighbours, jobs)
     around = half.coarser().surfels(1, jobs)
-    tolerant = orientation_grid(fine, reach_cells * grid.cell, test_cells * grid.cell)
+    test_cell = max(diameter / test_cells_across, 2.0 * grid.cell)
+    tolerant = orientation_grid(fine, 0.5 * test_cell, test_cell)
     bends = flatness_around(fine, around)
-    return Scene(fine, coarse, tolerant, bends, 3.0 * around.cell, grid.depth_maps(), grid.points, grid.unaddressable)
+    return Scene(
+        fine,
+        coarse,
+        tolerant,
+        bends,
+        3.0 * around.cell,
+        grid.depth_maps(),
+        quiet(fine.flatness),
+        grid.points,
+        grid.unaddressable,
+    )
+
+
+def quiet(flatness: Floats) -> float:
+    """The noise in some surfels' flatness, metres: their flatter quarter. Edges and bends spread the rest."""
+    return float(np.quantile(flatness, 0.25)) if len(flatness) else 0.0
 
 
 def flatness_around(fine: Surfels, around: Surfels) -> Floats:
@@ -121,7 +141,9 @@ def orientation_grid(surfels: Surfels, reach: float, cell: float) -> Orientation
             masks, counts,
         )  # fmt: skip
         if at == len(surfels.means):
-            return OrientationGrid(cell, hash_keys, hash_values, masks[: counts[0]])
+            masks = masks[: counts[0]]
+            bits = np.packbits(masks != 0, axis=1, bitorder="little").view(np.uint64)
+            return OrientationGrid(cell, hash_keys, hash_values, bits, masks)
         room *= 2
         block_keys = np.concatenate([block_keys, np.empty_like(block_keys)])
         masks = np.concatenate([masks, np.empty_like(masks)])

@@ -54,7 +54,7 @@ class SearchParameters:
     max_tries : directions tried from s1 before another is drawn
     tests : model samples in the sequential test
     chance_overlap : share of samples of a wrong hypothesis that lie on the scene, for Wald's test
-    test_cells, reach_cells : cell of the test and how far a sample may be off along the normal, in fine cells
+    test_cells_across : cells of the test along the diameter of the smallest model
     kept : hypotheses refined each round, for each model
     """
 
@@ -70,20 +70,20 @@ class SearchParameters:
     max_tries: int = 1000
     tests: int = 192
     chance_overlap: float = 0.1
-    test_cells: float = 4.0
-    reach_cells: float = 2.0
+    test_cells_across: float = 45.0
     kept: int = 48
 
 
 class ModelArrays(NamedTuple):
     """The samples of all models sought, end to end.
 
-    starts : (models+1,) int64; points, normals : (N, 3); centres (models, 3), radii (models,) : of the samples, metres
+    starts : (models+1,) int64; points, normals : (N, 3); samples : (N, 6) float32, both side by side; centres (models, 3), radii (models,) : of the samples, metres
     """
 
     starts: NDArray[np.int64]
     points: Floats
     normals: Floats
+    samples: NDArray[np.float32]
     centres: Floats
     radii: Floats
 
@@ -119,6 +119,7 @@ def model_arrays(models: Sequence[Model]) -> ModelArrays:
         np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
         np.concatenate([m.samples.points for m in models]),
         np.concatenate([m.samples.normals for m in models]),
+        np.concatenate([np.hstack([m.samples.points, m.samples.normals]) for m in models]).astype(np.float32),
         centres, radii,
     )  # fmt: skip
 
@@ -210,8 +211,8 @@ class Search:
             test_pairs(
                 start, stop, first, second, signs, keys, fine.means, fine.normals,
                 table.offsets, table.model, table.first, table.second, arrays.starts, arrays.points, arrays.normals,
-                self.done, self.parameters.normal_length_m, tolerant.cell, tolerant.hash_keys, tolerant.hash_values,
-                tolerant.masks, self._least_hits, hits, models, rotations, translations, work,
+                arrays.samples, self.done, self.parameters.normal_length_m, tolerant.cell, tolerant.hash_keys, tolerant.hash_values,
+                tolerant.occupied, tolerant.masks, self._least_hits, hits, models, rotations, translations, work,
             )  # fmt: skip
             return work
 

@@ -40,7 +40,7 @@ class GridParameters:
     cell_m: float | None = None
     cells_across: float = 180.0
     least_cells_across: float = 40.0
-    points_per_cell: float = 2.0
+    points_per_cell: float = 1.25
     min_neighbours: int = 5
 
 

@@ -28,9 +28,11 @@ class VerifyParameters:
     min_score : least score of a detection
     min_support : least share of samples on the scene
     min_support_blind : the same where no scanner position is known and free space can say nothing
-    gate_cells, inlier_cells : a sample is supported by a surfel this near whose plane it meets this closely, in cells
+    gate_cells : a sample is supported by a surfel at most this far away, in cells …
+    inlier_noises, inlier_cells : … whose plane it meets within so many times the scan's noise and so much of a cell: a
+        bent surface leaves the plane of a surfel by h²/8r, a twentieth of a cell on a pipe as wide as five cells
     normal_agreement : least cosine between a sample's and its surfel's normal
-    margin_cells : a beam passed through a sample if it went on so far behind it, in cells
+    margin_inliers, margin_cells : a beam passed through a sample if it went on so far behind it
     least_facing : cosine to the beam below which a surface may return nothing
     penalty_weight : how much a sample seen through counts against one supported; 0: the paper, which looks at support
     shared : share of its support a detection may have in common with a better one
@@ -41,12 +43,14 @@ class VerifyParameters:
     min_support: float = 0.1
     min_support_blind: float = 0.35
     gate_cells: float = 1.0
-    inlier_cells: float = 0.5
+    inlier_noises: float = 3.0
+    inlier_cells: float = 0.15
     normal_agreement: float = 0.8
-    margin_cells: float = 2.5
+    margin_inliers: float = 2.0
+    margin_cells: float = 1.0
     least_facing: float = 0.25
     penalty_weight: float = 1.0
-    shared: float = 0.5
+    shared: float = 0.2
     alternatives: int = 24
 
 
@@ -122,14 +126,16 @@ def gather(
     states, residuals, claims = np.empty(total, np.uint8), np.empty(total, np.float32), np.empty(total, np.int32)
     fine = scene.fine
     origins, ranges = scene.origins(), scene.ranges()
+    inlier = parameters.inlier_noises * scene.noise + parameters.inlier_cells * fine.cell
+    margin = parameters.margin_inliers * inlier + parameters.margin_cells * fine.cell
     edge = scene.depths[0].edge if scene.depths else 1
     in_threads(
         jobs, len(sizes),
         lambda start, stop: gather_evidence(
             start, stop, hypotheses.models, arrays.starts, arrays.points, arrays.normals, hypotheses.rotations,
-            hypotheses.translations, parameters.gate_cells * fine.cell, parameters.inlier_cells * fine.cell,
+            hypotheses.translations, parameters.gate_cells * fine.cell, inlier,
             parameters.normal_agreement, signed, fine.cell, fine.hash_keys, fine.hash_values, fine.block_cells,
-            fine.first_surfel, fine.means, fine.normals, origins, ranges, edge, parameters.margin_cells * fine.cell,
+            fine.first_surfel, fine.means, fine.normals, origins, ranges, edge, margin,
             parameters.least_facing, ends - sizes, states, residuals, claims,
         ),
     )  # fmt: skip

@@ -172,36 +172,46 @@ def mark_orientations(means, normals, reach, cell, spread, signed, hash_keys, ha
 
 
 @njit(cache=True, nogil=True)
-def lies_on_scene(point, normal, rotation, translation, inverse, hash_keys, hash_values, masks):
-    """Does a placed model point lie in a cell marked with its normal's direction?"""
-    x = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
-    y = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
-    z = rotation[2, 0] * point[0] + rotation[2, 1] * point[1] + rotation[2, 2] * point[2] + translation[2]
-    cx, cy, cz = np.int64(floor(x * inverse)), np.int64(floor(y * inverse)), np.int64(floor(z * inverse))
+def lies_on_scene(samples, at, rotation, translation, inverse, hash_keys, hash_values, occupied, masks):
+    """Does sample number `at` (point and normal), placed, lie in a cell marked with its normal's direction?"""
+    px, py, pz = float(samples[at, 0]), float(samples[at, 1]), float(samples[at, 2])
+    r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
+    r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
+    r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
+    cx = np.int64(floor((r00 * px + r01 * py + r02 * pz + translation[0]) * inverse))
+    cy = np.int64(floor((r10 * px + r11 * py + r12 * pz + translation[1]) * inverse))
+    cz = np.int64(floor((r20 * px + r21 * py + r22 * pz + translation[2]) * inverse))
     block = find_block(hash_keys, hash_values, pack_block(cx >> 3, cy >> 3, cz >> 3))
     if block < 0:
         return False
-    mask = masks[block, ((cx & 7) << 6) | ((cy & 7) << 3) | (cz & 7)]
-    if mask == 0:
+    local = ((cx & 7) << 6) | ((cy & 7) << 3) | (cz & 7)
+    # Most samples of a wrong pose end here, in bits that fit the cache; the masks, 64 times as large, do not.
+    if not (occupied[block, local >> 6] >> np.uint64(local & 63)) & np.uint64(1):
         return False
-    return mask & normal_bit(
-        rotation[0, 0] * normal[0] + rotation[0, 1] * normal[1] + rotation[0, 2] * normal[2],
-        rotation[1, 0] * normal[0] + rotation[1, 1] * normal[1] + rotation[1, 2] * normal[2],
-        rotation[2, 0] * normal[0] + rotation[2, 1] * normal[1] + rotation[2, 2] * normal[2],
-    ) != np.uint64(0)  # fmt: skip
+    nx, ny, nz = float(samples[at, 3]), float(samples[at, 4]), float(samples[at, 5])
+    x, y, z = r00 * nx + r01 * ny + r02 * nz, r10 * nx + r11 * ny + r12 * nz, r20 * nx + r21 * ny + r22 * nz
+    return (masks[block, local] & normal_bit(x, y, z)) != np.uint64(0)
+
+
+@njit(cache=True, nogil=True)
+def fetch(points, normals, i, sign, point, normal):
+    """Copy an oriented point: a view of a row would count references, which costs two threads more than the copy."""
+    for c in range(3):
+        point[c], normal[c] = points[i, c], sign * normals[i, c]
 
 
 @njit(cache=True, nogil=True)
 def test_pairs(
     start, stop, pair_first, pair_second, pair_signs, pair_keys, means, normals,
-    offsets, entry_model, entry_first, entry_second, model_starts, model_points, model_normals, skip_model,
-    length, cell, hash_keys, hash_values, masks, least_hits,
+    offsets, entry_model, entry_first, entry_second, model_starts, model_points, model_normals, samples, skip_model,
+    length, cell, hash_keys, hash_values, occupied, masks, least_hits,
     best_hits, best_model, best_rotation, best_translation, work,
 ):  # fmt: skip
     """Test every hypothesis of scene pairs start … stop; keep the best of each pair.
 
     offsets, entry_* : the library's hash table in CSR form; entry_first, entry_second : samples of entry_model
     model_starts : (models+1,) where each model's samples begin in model_points, model_normals
+    samples : (N, 6) float32, the same points and normals side by side, for the test
     skip_model : (models,) True for models no longer sought
     length : metres, of the normals in the four-point sets; 0 for the limit (see pair_pose)
     least_hits : (T+1,) Wald's test as a table: after k points fewer hits than least_hits[k] end it
@@ -211,23 +221,21 @@ def test_pairs(
     inverse = 1.0 / cell
     scene, model = np.empty((4, 4)), np.empty((4, 4))
     rotation, translation = np.empty((3, 3)), np.empty(3)
-    b1, b2 = np.empty(3), np.empty(3)
+    m1, a1, m2, a2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    s1, b1, s2, b2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     last = least_hits.shape[0] - 1
     for k in range(start, stop):
         best_hits[k] = 0
-        i, j = pair_first[k], pair_second[k]
-        s1, s2 = means[i], means[j]
-        sa, sb = 1.0 - 2.0 * (pair_signs[k] & 1), 1.0 - (pair_signs[k] & 2)
-        for c in range(3):
-            b1[c], b2[c] = sa * normals[i, c], sb * normals[j, c]
+        fetch(means, normals, pair_first[k], 1.0 - 2.0 * (pair_signs[k] & 1), s1, b1)
+        fetch(means, normals, pair_second[k], 1.0 - (pair_signs[k] & 2), s2, b2)
         frame_of_pair(s1, b1, s2, b2, scene)
         for entry in range(offsets[pair_keys[k]], offsets[pair_keys[k] + 1]):
             which = entry_model[entry]
             if skip_model[which]:
                 continue
             base, n = model_starts[which], model_starts[which + 1] - model_starts[which]
-            m1, m2 = model_points[base + entry_first[entry]], model_points[base + entry_second[entry]]
-            a1, a2 = model_normals[base + entry_first[entry]], model_normals[base + entry_second[entry]]
+            fetch(model_points, model_normals, base + entry_first[entry], 1.0, m1, a1)
+            fetch(model_points, model_normals, base + entry_second[entry], 1.0, m2, a2)
             frame_of_pair(m1, a1, m2, a2, model)
             if not pose_from_frames(model, scene, rotation):
                 continue
@@ -239,9 +247,7 @@ def test_pairs(
             for t in range(last):
                 # A model with fewer samples than the test has points is gone through again.
                 at = base + t % n
-                if lies_on_scene(
-                    model_points[at], model_normals[at], rotation, translation, inverse, hash_keys, hash_values, masks
-                ):
+                if lies_on_scene(samples, at, rotation, translation, inverse, hash_keys, hash_values, occupied, masks):
                     hits += 1
                 if hits < least_hits[t + 1]:
                     work[1] += t + 1
@@ -253,5 +259,7 @@ def test_pairs(
             if hits > best_hits[k]:
                 best_hits[k] = hits
                 best_model[k] = which
-                best_rotation[k] = rotation
-                best_translation[k] = translation
+                for r in range(3):
+                    best_translation[k, r] = translation[r]
+                    for c in range(3):
+                        best_rotation[k, r, c] = rotation[r, c]
