@@ -1,0 +1,65 @@
+"""Plain twins of the core method's kernels: numpy, one thing at a time, by another way where there is one."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def kabsch(source: Floats, target: Floats) -> tuple[Floats, Floats]:
+    """Least-squares rotation (3, 3), det +1, and translation (3,) of matching points (N, 3), by SVD."""
+    a, b = source.mean(axis=0), target.mean(axis=0)
+    u, _, vt = np.linalg.svd((target - b).T @ (source - a))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return rotation, b - rotation @ a
+
+
+def four_points(p: Floats, n: Floats, q: Floats, m: Floats, length: float) -> Floats:
+    """The paper's Figure 8: two points and the ends of their normals, (4, 3)."""
+    return np.stack([p, q, p + length * n, q + length * m])
+
+
+def feature(p: Floats, n: Floats, q: Floats, m: Floats) -> Floats:
+    """F = (∠(n, d), ∠(m, d), ∠(n, m)) of a pair of oriented points, radians."""
+    d = (q - p) / np.linalg.norm(q - p)
+    angles: Floats = np.arccos(np.clip([n @ d, m @ d, n @ m], -1.0, 1.0))
+    return angles
+
+
+def surfels(points: Floats, origins: Floats, cell: float, least: int) -> dict[tuple[int, ...], tuple[Floats, Floats]]:
+    """Each occupied cell's mean and normal by PCA over all points in its 3×3×3 cells, towards its points' scanner.
+
+    origins : (N, 3) the scanner of each point. A cell with fewer than `least` occupied around it has normal zero.
+    """
+    members: dict[tuple[int, ...], list[int]] = defaultdict(list)
+    for k, where in enumerate(np.floor(points / cell).astype(int).tolist()):
+        members[tuple(where)].append(k)
+    found = {}
+    for where, inside in members.items():
+        around = [members[near] for step in product((-1, 0, 1), repeat=3)
+                  if (near := (where[0] + step[0], where[1] + step[1], where[2] + step[2])) in members]  # fmt: skip
+        normal = np.zeros(3)
+        if len(around) >= least:
+            pooled = points[np.concatenate(around)]
+            normal = np.linalg.eigh(np.cov(pooled.T, bias=True))[1][:, 0]
+            towards = origins[inside] - points[inside]
+            towards /= np.linalg.norm(towards, axis=1)[:, None]
+            normal *= np.sign(towards.sum(axis=0) @ normal)
+        found[where] = points[inside].mean(axis=0), normal
+    return found
+
+
+def nearest(
+    point: Floats, normal: Floats, means: Floats, normals: Floats, gate: float, cosine: float, signed: bool
+) -> int:
+    """The nearest surfel closer than `gate` with a like normal, -1 where there is none."""
+    alike = normals @ normal if signed else np.abs(normals @ normal)
+    far = np.linalg.norm(means - point, axis=1)
+    far[(alike < cosine) | (far >= gate)] = np.inf
+    best = int(far.argmin())
+    return best if far[best] < np.inf else -1
