@@ -85,7 +85,7 @@ def source_of(scan: Scan, origin: Floats | None, number: int) -> Source:
         path = Path(scan)
         info = scan_info(path)
         return Source(str(scan), info.points, info.crs, lambda: read_scan(path, origin=origin))
-    cloud = scan if isinstance(scan, PointCloud) else PointCloud(as_points(scan))
+    cloud = replace(scan, xyz=as_points(scan.xyz)) if isinstance(scan, PointCloud) else PointCloud(as_points(scan))
     if cloud.origin is None and origin is not None:
         cloud = replace(cloud, origin=origin)
     return Source(f"array {number}", len(cloud), None, lambda: chunks_of(cloud))
@@ -99,7 +99,8 @@ def chunks_of(cloud: PointCloud, chunk_points: int = CHUNK_POINTS) -> Iterator[P
         index = np.arange(start, start + len(xyz), dtype=np.int64)
         columns = {name: column[start : start + len(xyz)] for name, column in cloud.attributes.items()}
         # One pass over the sum: it is finite only where every coordinate is.
-        finite = np.isfinite(xyz.sum(axis=1))
+        with np.errstate(invalid="ignore", over="ignore"):
+            finite = np.isfinite(xyz.sum(axis=1))
         if finite.all():
             yield PointChunk(xyz, columns, index, 0, origin)
         else:

@@ -55,10 +55,11 @@ def accumulate(
     for i in range(start, n):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         gx, gy, gz = (px - offset[0]) * inverse, (py - offset[1]) * inverse, (pz - offset[2]) * inverse
-        fx, fy, fz = floor(gx), floor(gy), floor(gz)
-        if not (abs(fx) < 8 * (BIAS - 2) and abs(fy) < 8 * (BIAS - 2) and abs(fz) < 8 * (BIAS - 2)):
+        # Before floor, which makes an int64 of it: the 1e38 some exporters write for "no data" would wrap round.
+        if not (abs(gx) < 8 * (BIAS - 2) and abs(gy) < 8 * (BIAS - 2) and abs(gz) < 8 * (BIAS - 2)):
             counts[2] += 1
             continue
+        fx, fy, fz = floor(gx), floor(gy), floor(gz)
         cx, cy, cz = np.int64(fx), np.int64(fy), np.int64(fz)
         if has_origin:
             dx, dy, dz = origin[0] - px, origin[1] - py, origin[2] - pz
