@@ -31,10 +31,13 @@ def feature(p: Floats, n: Floats, q: Floats, m: Floats) -> Floats:
     return angles
 
 
-def surfels(points: Floats, origins: Floats, cell: float, least: int) -> dict[tuple[int, ...], tuple[Floats, Floats]]:
+def surfels(
+    points: Floats, origins: Floats, cell: float, least: int
+) -> dict[tuple[int, ...], tuple[Floats, Floats, bool]]:
     """Each occupied cell's mean and normal by PCA over all points in its 3×3×3 cells, towards its points' scanner.
 
-    origins : (N, 3) the scanner of each point. A cell with fewer than `least` occupied around it has normal zero.
+    origins : (N, 3) the scanner of each point. A cell with fewer than `least` occupied around it has normal zero. The
+    third part tells whether the normal is well defined: a surface rather than a blob or a line, not seen edge on.
     """
     members: dict[tuple[int, ...], list[int]] = defaultdict(list)
     for k, where in enumerate(np.floor(points / cell).astype(int).tolist()):
@@ -43,14 +46,15 @@ def surfels(points: Floats, origins: Floats, cell: float, least: int) -> dict[tu
     for where, inside in members.items():
         around = [members[near] for step in product((-1, 0, 1), repeat=3)
                   if (near := (where[0] + step[0], where[1] + step[1], where[2] + step[2])) in members]  # fmt: skip
-        normal = np.zeros(3)
+        normal, sure = np.zeros(3), False
         if len(around) >= least:
             pooled = points[np.concatenate(around)]
-            normal = np.linalg.eigh(np.cov(pooled.T, bias=True))[1][:, 0]
+            values, vectors = np.linalg.eigh(np.cov(pooled.T, bias=True))
             towards = origins[inside] - points[inside]
-            towards /= np.linalg.norm(towards, axis=1)[:, None]
-            normal *= np.sign(towards.sum(axis=0) @ normal)
-        found[where] = points[inside].mean(axis=0), normal
+            facing = (towards / np.linalg.norm(towards, axis=1)[:, None]).mean(axis=0) @ vectors[:, 0]
+            normal = vectors[:, 0] * np.sign(facing)
+            sure = bool(values[1] > 1.2 * values[0] + 1e-8 and abs(facing) > 1e-3)
+        found[where] = points[inside].mean(axis=0), normal, sure
     return found
 
 
