@@ -32,7 +32,7 @@ class Candidate(NamedTuple):
     """A refined pose with what the scene says of it.
 
     rotation (3, 3), translation (3,) : scene_from_model, relative to the grid's offset; hessian (6, 6) : of ICP
-    score : 0 … 1; area : net supported surface, m², by which conflicting poses are ranked
+    score : 0 … 1; area : supported surface less what was seen through, each part counted by how much it tells, m², by which conflicting poses are ranked
     """
 
     model: int
@@ -53,6 +53,7 @@ class Recognition:
         self.scene, self.models, self.parameters, self.jobs = scene, models, parameters, jobs
         self.arrays = model_arrays(models)
         self.search = Search(scene, models, table, self.arrays, parameters.search, seed, jobs)
+        self.telling = self.search.telling()
         self.signed = scene.fine.signed and all(model.signed for model in models)
         self.blind = not scene.depths
         self.believed: list[Candidate] = []
@@ -112,16 +113,16 @@ class Recognition:
     def candidates(self, refined: Refined) -> list[Candidate]:
         """Refined poses with their evidence."""
         verify = self.parameters.verify
-        evidence = gather(refined.hypotheses, self.scene, self.arrays, self.signed, verify, self.jobs)
+        evidence = gather(refined.hypotheses, self.scene, self.telling, self.arrays, self.signed, verify, self.jobs)
         found = []
         for k, seen in enumerate(evidence):
             number = int(refined.hypotheses.models[k])
             model = self.models[number]
-            net = seen.supported - verify.penalty_weight * seen.seen_through
+            net = seen.telling - verify.penalty_weight * seen.penalty()
             found.append(
                 Candidate(
                     number, refined.hypotheses.rotations[k], refined.hypotheses.translations[k], refined.hessians[k],
-                    seen, score(seen, self.blind, verify), net * AREA_OF_A_SAMPLE * model.spacing**2,
+                    seen, score(seen, self.blind, verify), net * seen.samples * AREA_OF_A_SAMPLE * model.spacing**2,
                 )
             )  # fmt: skip
         return found

@@ -23,6 +23,10 @@ Floats = NDArray[np.float64]
 
 # Poisson disks jam at 0.56 of the plane, not at the 0.91 of a hexagonal packing: a sample stands for 1.4 spacing².
 AREA_OF_A_SAMPLE = 1.4
+# Fewer surfels than this make pairs that repeat each other.
+LEAST_POOL = 20_000
+# With so many scanner positions nearly every sample faces one, and asking costs more than it tells.
+FACING_ORIGINS = 6
 # Directions on the sphere a second point is sought in, drawn once: 0.4 MB stay in the cache, where a sine and a cosine
 # a try would cost more than the look-up they lead to.
 DIRECTIONS = 1 << 14
@@ -40,7 +44,9 @@ RIGHT_PAIR_FINDS = 0.1
 class SearchParameters:
     """How the search is carried out.
 
-    overlap_ratio : λs, the share of a model's samples that must lie on the scene (the paper: 0.15)
+    overlap_ratio : λs, the share of a model's samples that must lie on the scene (the paper: 0.15) …
+    facing_only : … of those that face a scanner position, where all are known: a chunky part seen from one side shows a
+        quarter of its surface
     time_limit_s : seconds for search, verification and refinement together; None: until nothing is likely to be missed
     miss_probability : stop when an instance that shows `overlap_ratio` of its surface has been missed with less than
         this chance; 0: use all of the time limit, as the paper does
@@ -64,12 +70,13 @@ class SearchParameters:
     max_instances: int | None = None
     pairs_a_round: int = 50_000
     hypotheses_a_round: int = 400_000
+    facing_only: bool = True
     by_shape: bool = True
     telling_first: bool = True
     normal_length_m: float = 0.0
     max_tries: int = 1000
     tests: int = 192
-    chance_overlap: float = 0.1
+    chance_overlap: float = 0.15
     test_cells_across: float = 45.0
     kept: int = 48
 
@@ -151,7 +158,9 @@ class Search:
         self.pairs = models[0].parameters.pairs
         self.rungs = sorted({rung for m in models for rung in rungs_of(m.diameter, m.parameters.pairs)}, reverse=True)
         self._classes = shape_classes(scene.bends, scene.window)
-        self._classes[~scene.fine.has_normal()] = -1
+        self._free = scene.fine.has_normal()
+        known = parameters.facing_only and scene.fine.signed and len(scene.depths) <= FACING_ORIGINS
+        self._origins = scene.origins() if known else np.empty((0, 3))
         self.model_shapes = np.array([model_shape(model, scene.window) for model in models])
         # As far as two samples of a model may be off, but never less than the scene's own resampling.
         self._tolerance = max(scene.fine.cell, self.pairs.tolerance * min(model.spacing for model in models))
@@ -171,21 +180,35 @@ class Search:
 
     def withdraw(self, surfels: NDArray[np.intp]) -> None:
         """Draw no more from surfels that are explained."""
-        self._classes[surfels] = -1
+        self._free[surfels] = False
         self._fill_pool()
 
     def _fill_pool(self) -> None:
         """Choose the surfels that may be drawn: each with a chance by the likelihood ratio of its shape."""
-        counts = np.bincount(self._classes[self._classes >= 0], minlength=len(BEND_BORDERS) + 1)
+        counts = np.bincount(self._classes[self._free], minlength=len(BEND_BORDERS) + 1)
         ratio = np.where(counts > 0, self.model_shapes.mean(axis=0) / np.maximum(counts, 1), 0.0)
-        self._kept = np.minimum(1.0, ratio / max(ratio.max(), 1e-300)) if self.parameters.by_shape else counts > 0
-        chance = np.append(self._kept, 0.0)[self._classes]  # class -1, the last, is never drawn
+        kept = ratio / max(ratio.max(), 1e-300) if self.parameters.by_shape else np.ones(len(counts))
+        # Where the telling surfels are few, the others fill up: they may be all there is to draw from.
+        while 0 < np.minimum(kept, 1.0) @ counts < min(LEAST_POOL, 0.9 * counts.sum()):
+            kept = kept * 1.25
+        self._kept = np.minimum(kept, 1.0)
+        chance = np.where(self._free, self._kept[self._classes], 0.0)
         luck = np.random.default_rng([self.seed, len(self.pool)]).random(len(chance))
         self.pool = np.flatnonzero(luck < chance)
         self._bins = {
             rung: bin_pool(self.pool, self.scene.fine.means, rung_distance(rung, self.pairs) / BINS_A_DISTANCE)
             for rung in self.rungs
         }
+
+    def telling(self) -> Floats:
+        """How much each surfel tells, (S,), 0 … 1: the likelihood ratio of its shape, model against scene.
+
+        A plate flush with a floor lies on the scene with all of its samples, and that means nothing.
+        """
+        counts = np.bincount(self._classes[self.scene.fine.has_normal()], minlength=len(BEND_BORDERS) + 1)
+        ratio = np.where(counts > 0, self.model_shapes.mean(axis=0) / np.maximum(counts, 1), 0.0)
+        weights = np.sqrt(ratio / max(ratio.max(), 1e-300)) if self.parameters.by_shape else np.ones(len(counts))
+        return np.asarray(weights[self._classes])
 
     def may_stop(self) -> bool:
         """Has an instance of any model still sought been missed with less than the chance allowed?"""
@@ -202,7 +225,7 @@ class Search:
 
         first, second, signs, keys = self._telling_pairs()
         count = len(first)
-        hits, models = np.zeros(count, np.int64), np.zeros(count, np.int64)
+        support, models = np.zeros(count), np.zeros(count, np.int64)
         rotations, translations = np.empty((count, 3, 3)), np.empty((count, 3))
         fine, tolerant, table, arrays = self.scene.fine, self.scene.tolerant, self.table, self.arrays
 
@@ -212,7 +235,7 @@ class Search:
                 start, stop, first, second, signs, keys, fine.means, fine.normals,
                 table.offsets, table.model, table.first, table.second, arrays.starts, arrays.points, arrays.normals,
                 arrays.samples, self.done, self.parameters.normal_length_m, tolerant.cell, tolerant.hash_keys, tolerant.hash_values,
-                tolerant.occupied, tolerant.masks, self._least_hits, hits, models, rotations, translations, work,
+                tolerant.occupied, tolerant.masks, self._least_hits, self._origins, support, models, rotations, translations, work,
             )  # fmt: skip
             return work
 
@@ -221,8 +244,8 @@ class Search:
         self.lookups += int(work[1])
         self.tested += count
         self.rounds += 1
-        order = np.argsort(-hits, kind="stable")[: np.count_nonzero(hits)]
-        return Hypotheses(models[order], rotations[order], translations[order], hits[order] / self.parameters.tests)
+        order = np.argsort(-support, kind="stable")[: np.count_nonzero(support)]
+        return Hypotheses(models[order], rotations[order], translations[order], support[order])
 
     def _telling_pairs(self) -> tuple[NDArray[np.int64], ...]:
         """Draw a round's pairs; of those the library knows, the most telling that the round can afford to test."""

@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 DEPTH_PIXELS = 360  # along an edge of the cube map: 0.25° a pixel, 35 mm at 8 m
+# Where a scan has fewer beams than pixels, pixels are joined until most of what was looked at has a range.
+MOST_HOLES, LEAST_DEPTH_PIXELS = 0.15, 45
 EMPTY_BLOCKS, EMPTY_ROWS = 1024, 1 << 16
 ROWS_AT_ONCE = 64  # what one block may ask for (kernels.grid.sum_children)
 
@@ -39,7 +41,7 @@ class GridParameters:
 
     cell_m: float | None = None
     cells_across: float = 180.0
-    least_cells_across: float = 40.0
+    least_cells_across: float = 30.0
     points_per_cell: float = 1.25
     min_neighbours: int = 5
 
@@ -86,6 +88,18 @@ class DepthMap(NamedTuple):
     origin: Floats
     ranges: NDArray[np.float32]
     edge: int
+
+    def coarser(self) -> DepthMap:
+        """Pixels of twice the edge, each the nearest of its four."""
+        half = self.edge // 2
+        pixels = self.ranges.reshape(6, half, 2, half, 2)
+        return DepthMap(self.origin, pixels.min(axis=(2, 4)).reshape(-1), half)
+
+    def holes(self) -> float:
+        """Share of empty pixels among the four of each coarser pixel that saw anything: 3/4 where beams are sparse."""
+        filled = float(np.isfinite(self.ranges).sum())
+        around = 4.0 * float(np.isfinite(self.coarser().ranges).sum())
+        return 1.0 - filled / around if around else 0.0
 
 
 class MomentGrid:
@@ -176,7 +190,10 @@ class MomentGrid:
 
     def depth_maps(self) -> list[DepthMap]:
         """One for each scanner position, in the order of their coordinates."""
-        return [DepthMap(np.array(key), self._depths[key], DEPTH_PIXELS) for key in sorted(self._depths)]
+        maps = [DepthMap(np.array(key), self._depths[key], DEPTH_PIXELS) for key in sorted(self._depths)]
+        while maps and maps[0].edge > LEAST_DEPTH_PIXELS and max(depth.holes() for depth in maps) > MOST_HOLES:
+            maps = [depth.coarser() for depth in maps]
+        return maps
 
     def surfels(self, min_neighbours: int = 5, jobs: int = 1) -> Surfels:
         """The mean and the oriented normal of each cell (paper 3.2: PCA over a neighbourhood)."""

@@ -39,7 +39,7 @@ class VerifyParameters:
     alternatives : how many poses a model could be mistaken for, by its own symmetry, are tried against the best
     """
 
-    min_score: float = 0.85
+    min_score: float = 0.9
     min_support: float = 0.1
     min_support_blind: float = 0.35
     gate_cells: float = 1.0
@@ -63,6 +63,7 @@ class Evidence(NamedTuple):
     """What the scene says of the samples of one pose.
 
     samples : N; supported, seen_through, hidden : how many of them
+    telling : share of all samples that are supported, each counted by how much its surfel tells (Search.telling)
     rms : of the supported samples' distances to the scene, metres
     claims : surfels that support it, ascending
     """
@@ -71,6 +72,7 @@ class Evidence(NamedTuple):
     supported: int
     seen_through: int
     hidden: int
+    telling: float
     rms: float
     claims: NDArray[np.intp]
 
@@ -98,7 +100,7 @@ def score(evidence: Evidence, blind: bool, parameters: VerifyParameters) -> floa
     spoken = evidence.supported + parameters.penalty_weight * evidence.seen_through
     visible = evidence.supported / spoken if spoken else 0.0
     # Few supported samples can agree by chance: the visible share is believed as far as their number goes.
-    return visible * float(1.0 - np.exp(-evidence.support() / BELIEVED_SUPPORT))
+    return visible * float(1.0 - np.exp(-evidence.telling / BELIEVED_SUPPORT))
 
 
 def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters) -> str:
@@ -115,9 +117,10 @@ def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters) -
 
 
 def gather(
-    hypotheses: Hypotheses, scene: Scene, arrays: ModelArrays, signed: bool, parameters: VerifyParameters, jobs: int
-) -> list[Evidence]:
-    """The evidence of each of H hypotheses."""
+    hypotheses: Hypotheses, scene: Scene, telling: Floats, arrays: ModelArrays, signed: bool,
+    parameters: VerifyParameters, jobs: int,
+) -> list[Evidence]:  # fmt: skip
+    """The evidence of each of H hypotheses; telling (S,) is how much each surfel tells (Search.telling)."""
     from scanfind.kernels.evidence import HIDDEN, SEEN_THROUGH, SUPPORTED, gather_evidence
 
     sizes = (arrays.starts[1:] - arrays.starts[:-1])[hypotheses.models]
@@ -147,6 +150,7 @@ def gather(
         found.append(
             Evidence(
                 int(stop - start), int(on.sum()), int((state == SEEN_THROUGH).sum()), int((state == HIDDEN).sum()),
+                float(telling[claim[on]].sum()) / int(stop - start),
                 float(np.sqrt(squares.mean())) if len(squares) else float("inf"), np.unique(claim[on]).astype(np.intp),
             )
         )  # fmt: skip

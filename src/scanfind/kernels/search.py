@@ -172,25 +172,36 @@ def mark_orientations(means, normals, reach, cell, spread, signed, hash_keys, ha
 
 
 @njit(cache=True, nogil=True)
-def lies_on_scene(samples, at, rotation, translation, inverse, hash_keys, hash_values, occupied, masks):
-    """Does sample number `at` (point and normal), placed, lie in a cell marked with its normal's direction?"""
+def lies_on_scene(samples, at, rotation, translation, origins, inverse, hash_keys, hash_values, occupied, masks):
+    """Does sample number `at` (point and normal), placed, lie in a cell marked with its normal's direction?
+
+    1 if it does, 0 if not, -1 if it faces none of the scanner positions `origins` (K, 3) and so cannot tell (K > 0).
+    """
     px, py, pz = float(samples[at, 0]), float(samples[at, 1]), float(samples[at, 2])
+    nx, ny, nz = float(samples[at, 3]), float(samples[at, 4]), float(samples[at, 5])
     r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
     r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
     r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
-    cx = np.int64(floor((r00 * px + r01 * py + r02 * pz + translation[0]) * inverse))
-    cy = np.int64(floor((r10 * px + r11 * py + r12 * pz + translation[1]) * inverse))
-    cz = np.int64(floor((r20 * px + r21 * py + r22 * pz + translation[2]) * inverse))
+    x = r00 * px + r01 * py + r02 * pz + translation[0]
+    y = r10 * px + r11 * py + r12 * pz + translation[1]
+    z = r20 * px + r21 * py + r22 * pz + translation[2]
+    ux, uy, uz = r00 * nx + r01 * ny + r02 * nz, r10 * nx + r11 * ny + r12 * nz, r20 * nx + r21 * ny + r22 * nz
+    facing = origins.shape[0] == 0
+    for k in range(origins.shape[0]):
+        if ux * (origins[k, 0] - x) + uy * (origins[k, 1] - y) + uz * (origins[k, 2] - z) > 0.0:
+            facing = True
+            break
+    if not facing:
+        return -1
+    cx, cy, cz = np.int64(floor(x * inverse)), np.int64(floor(y * inverse)), np.int64(floor(z * inverse))
     block = find_block(hash_keys, hash_values, pack_block(cx >> 3, cy >> 3, cz >> 3))
     if block < 0:
-        return False
+        return 0
     local = ((cx & 7) << 6) | ((cy & 7) << 3) | (cz & 7)
     # Most samples of a wrong pose end here, in bits that fit the cache; the masks, 64 times as large, do not.
     if not (occupied[block, local >> 6] >> np.uint64(local & 63)) & np.uint64(1):
-        return False
-    nx, ny, nz = float(samples[at, 3]), float(samples[at, 4]), float(samples[at, 5])
-    x, y, z = r00 * nx + r01 * ny + r02 * nz, r10 * nx + r11 * ny + r12 * nz, r20 * nx + r21 * ny + r22 * nz
-    return (masks[block, local] & normal_bit(x, y, z)) != np.uint64(0)
+        return 0
+    return 1 if (masks[block, local] & normal_bit(ux, uy, uz)) != np.uint64(0) else 0
 
 
 @njit(cache=True, nogil=True)
@@ -204,8 +215,8 @@ def fetch(points, normals, i, sign, point, normal):
 def test_pairs(
     start, stop, pair_first, pair_second, pair_signs, pair_keys, means, normals,
     offsets, entry_model, entry_first, entry_second, model_starts, model_points, model_normals, samples, skip_model,
-    length, cell, hash_keys, hash_values, occupied, masks, least_hits,
-    best_hits, best_model, best_rotation, best_translation, work,
+    length, cell, hash_keys, hash_values, occupied, masks, least_hits, origins,
+    best_support, best_model, best_rotation, best_translation, work,
 ):  # fmt: skip
     """Test every hypothesis of scene pairs start … stop; keep the best of each pair.
 
@@ -215,7 +226,8 @@ def test_pairs(
     skip_model : (models,) True for models no longer sought
     length : metres, of the normals in the four-point sets; 0 for the limit (see pair_pose)
     least_hits : (T+1,) Wald's test as a table: after k points fewer hits than least_hits[k] end it
-    best_hits : out, hits among T points; 0 where no hypothesis passed
+    origins : (K, 3) scanner positions: samples that face none of them are passed over; none: all are tested
+    best_support : out, share of hits among the samples tested; 0 where no hypothesis passed
     work : (2,) out, hypotheses and look-ups
     """
     inverse = 1.0 / cell
@@ -225,7 +237,7 @@ def test_pairs(
     s1, b1, s2, b2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     last = least_hits.shape[0] - 1
     for k in range(start, stop):
-        best_hits[k] = 0
+        best_support[k] = 0.0
         fetch(means, normals, pair_first[k], 1.0 - 2.0 * (pair_signs[k] & 1), s1, b1)
         fetch(means, normals, pair_second[k], 1.0 - (pair_signs[k] & 2), s2, b2)
         frame_of_pair(s1, b1, s2, b2, scene)
@@ -243,21 +255,25 @@ def test_pairs(
                 refine_four_points(m1, a1, m2, a2, s1, b1, s2, b2, length, rotation)
             place_pair(m1, a1, m2, a2, s1, b1, s2, b2, length, rotation, translation)
             work[0] += 1
-            hits = 0
-            for t in range(last):
-                # A model with fewer samples than the test has points is gone through again.
-                at = base + t % n
-                if lies_on_scene(samples, at, rotation, translation, inverse, hash_keys, hash_values, occupied, masks):
-                    hits += 1
-                if hits < least_hits[t + 1]:
-                    work[1] += t + 1
-                    hits = -1
+            hits = tested = 0
+            for t in range(n):
+                found = lies_on_scene(
+                    samples, base + t, rotation, translation, origins, inverse, hash_keys, hash_values, occupied, masks
+                )  # fmt: skip
+                work[1] += 1
+                if found < 0:
+                    continue
+                hits += found
+                tested += 1
+                if hits < least_hits[tested]:
+                    tested = 0
                     break
-            if hits < 0:
+                if tested == last:
+                    break
+            if tested == 0 or hits < least_hits[last] * tested / last:
                 continue
-            work[1] += last
-            if hits > best_hits[k]:
-                best_hits[k] = hits
+            if hits / tested > best_support[k]:
+                best_support[k] = hits / tested
                 best_model[k] = which
                 for r in range(3):
                     best_translation[k, r] = translation[r]
