@@ -91,23 +91,22 @@ def number_cells(slot_starts, slot_cells, first_cell, moments, block_cells, cell
 
 
 @njit(cache=True, nogil=True)
-def add_moved(pool, m, ex, ey, ez):
-    """Add moments m, about a cell centre at offset e, to the pool about its own centre (offset units)."""
-    n = float(m[0])
-    sx, sy, sz = float(m[1]), float(m[2]), float(m[3])
+def add_moved(pool, table, row, ex, ey, ez):
+    """Add a row of moments, about a cell centre at offset e, to the pool about its own centre (offset units)."""
+    n, sx, sy, sz = float(table[row, 0]), float(table[row, 1]), float(table[row, 2]), float(table[row, 3])
     pool[0] += n
     pool[1] += sx + n * ex
     pool[2] += sy + n * ey
     pool[3] += sz + n * ez
-    pool[4] += m[4] + 2.0 * ex * sx + n * ex * ex
-    pool[5] += m[5] + ex * sy + ey * sx + n * ex * ey
-    pool[6] += m[6] + ex * sz + ez * sx + n * ex * ez
-    pool[7] += m[7] + 2.0 * ey * sy + n * ey * ey
-    pool[8] += m[8] + ey * sz + ez * sy + n * ey * ez
-    pool[9] += m[9] + 2.0 * ez * sz + n * ez * ez
-    pool[10] += m[10]
-    pool[11] += m[11]
-    pool[12] += m[12]
+    pool[4] += table[row, 4] + 2.0 * ex * sx + n * ex * ex
+    pool[5] += table[row, 5] + ex * sy + ey * sx + n * ex * ey
+    pool[6] += table[row, 6] + ex * sz + ez * sx + n * ex * ez
+    pool[7] += table[row, 7] + 2.0 * ey * sy + n * ey * ey
+    pool[8] += table[row, 8] + ey * sz + ez * sy + n * ey * ez
+    pool[9] += table[row, 9] + 2.0 * ez * sz + n * ez * ez
+    pool[10] += table[row, 10]
+    pool[11] += table[row, 11]
+    pool[12] += table[row, 12]
 
 
 @njit(cache=True, nogil=True)
@@ -166,11 +165,10 @@ def fit_surfels(
                     if found >= 0:
                         occupied += 1
                         add_moved(
-                            pool, totals[found],
+                            pool, totals, found,
                             (k // 9 - 1) * units, (k // 3 % 3 - 1) * units, (k % 3 - 1) * units,
                         )  # fmt: skip
             nx, ny, nz, low, _, _ = plane_of(pool)
-            own = totals[c]
             cx, cy, cz = ((bx << 3) + lx + 0.5) * cell, ((by << 3) + ly + 0.5) * cell, ((bz << 3) + lz + 0.5) * cell
 
             # A thin plate scanned from both sides: the sums of directions of its octants disagree about the side.
@@ -178,21 +176,20 @@ def fit_surfels(
             for slot in range(slot_starts[block], slot_starts[block + 1]):
                 row = slot_cells[slot, local]
                 if row >= 0:
-                    m = moments[row]
-                    along = m[10] * nx + m[11] * ny + m[12] * nz
+                    along = moments[row, 10] * nx + moments[row, 11] * ny + moments[row, 12] * nz
                     if along > 0.0:
-                        front += m[0]
+                        front += moments[row, 0]
                     elif along < 0.0:
-                        back += m[0]
-            two = occupied >= min_neighbours and min(front, back) >= max(2.0, 0.1 * own[0])
+                        back += moments[row, 0]
+            two = occupied >= min_neighbours and min(front, back) >= max(2.0, 0.1 * totals[c, 0])
             n_sides[c] = 2 if two else 1
             if not two:
-                means[c, 0, 0] = cx + own[1] / own[0] * unit
-                means[c, 0, 1] = cy + own[2] / own[0] * unit
-                means[c, 0, 2] = cz + own[3] / own[0] * unit
-                weights[c, 0] = own[0]
+                means[c, 0, 0] = cx + totals[c, 1] / totals[c, 0] * unit
+                means[c, 0, 1] = cy + totals[c, 2] / totals[c, 0] * unit
+                means[c, 0, 2] = cz + totals[c, 3] / totals[c, 0] * unit
+                weights[c, 0] = totals[c, 0]
                 flatness[c, 0] = sqrt(max(low, 0.0)) * unit
-                sign = -1.0 if own[10] * nx + own[11] * ny + own[12] * nz < 0.0 else 1.0
+                sign = -1.0 if totals[c, 10] * nx + totals[c, 11] * ny + totals[c, 12] * nz < 0.0 else 1.0
                 if occupied < min_neighbours:
                     sign = 0.0
                 normals[c, 0, 0], normals[c, 0, 1], normals[c, 0, 2] = sign * nx, sign * ny, sign * nz
@@ -210,15 +207,15 @@ def fit_surfels(
                     for slot in range(slot_starts[other], slot_starts[other + 1]):
                         row = slot_cells[slot, there]
                         if row >= 0:
-                            m = moments[row]
-                            if (m[10] * nx + m[11] * ny + m[12] * nz) * sign > 0.0:
+                            along = moments[row, 10] * nx + moments[row, 11] * ny + moments[row, 12] * nz
+                            if along * sign > 0.0:
                                 seen = True
                                 add_moved(
-                                    pool, m, (k // 9 - 1) * units,
+                                    pool, moments, row, (k // 9 - 1) * units,
                                     (k // 3 % 3 - 1) * units, (k % 3 - 1) * units,
                                 )  # fmt: skip
                                 if k == 13:
-                                    add_moved(side, m, 0.0, 0.0, 0.0)
+                                    add_moved(side, moments, row, 0.0, 0.0, 0.0)
                     occupied += 1 if seen else 0
                 means[c, s, 0] = cx + side[1] / side[0] * unit
                 means[c, s, 1] = cy + side[2] / side[0] * unit
