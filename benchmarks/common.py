@@ -1,0 +1,112 @@
+"""What every benchmark shares: seeds, how far a pose is off, and CSV files that say where they come from."""
+
+from __future__ import annotations
+
+import csv
+import platform
+import subprocess
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.pose import Pose
+from scanfind.threads import available_cores
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Floats = NDArray[np.float64]
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+STAGES = ("grid", "search", "refine", "verify", "isolate")
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """How far a pose is from the truth: of the model's centre in millimetres, of its rotation in degrees."""
+
+    mm: float
+    deg: float
+
+    def within(self, mm: float, deg: float) -> bool:
+        return self.mm <= mm and self.deg <= deg
+
+
+def pose_error(found: Pose, truth: Pose, centre: Floats) -> PoseError:
+    """At the model's centre (3,), model frame: an origin far from the model would turn degrees into millimetres."""
+    apart = np.linalg.norm(found.move(centre[None]) - truth.move(centre[None]))
+    return PoseError(1e3 * float(apart), float(np.degrees(found.difference(truth)[1])))
+
+
+def centre_of(points: Floats) -> Floats:
+    """Middle (3,) of the box around points (N, 3)."""
+    middle: Floats = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    return middle
+
+
+def seeds_of(text: str) -> list[int]:
+    """`3`, `1000-1019` or `1,5,9` as numbers."""
+    first, dash, last = text.partition("-")
+    return list(range(int(first), int(last) + 1)) if dash else [int(seed) for seed in text.split(",")]
+
+
+def median(values: Sequence[float]) -> float:
+    """NaN where there is none."""
+    return float(np.median(values)) if values else float("nan")
+
+
+def origin_lines(seeds: str, date: str) -> list[str]:
+    """On which machine, with what, from which commit."""
+    versions = " ".join(f"{name} {version(name)}" for name in ("numpy", "numba", "scanfind"))
+    return [
+        f"machine: {cpu_model()}, {available_cores()} cores",
+        f"versions: python {platform.python_version()} {versions}",
+        f"commit: {commit()}",
+        f"seeds: {seeds or 'none'}",
+        f"date: {date or 'none'}",
+    ]
+
+
+def write_csv(name: str, rows: Sequence[DataclassInstance], seeds: str, date: str, summary: Sequence[str] = ()) -> Path:
+    """Rows, all of one dataclass, as results/<name>.csv below comment lines of their origin and summary; its path."""
+    RESULTS.mkdir(exist_ok=True)
+    path = RESULTS / f"{name}.csv"
+    with path.open("w", newline="", encoding="utf-8") as file:
+        file.writelines(f"# {line}\n" for line in [*origin_lines(seeds, date), *summary])
+        writer = csv.DictWriter(file, [field.name for field in fields(rows[0])], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({column: _short(value) for column, value in asdict(row).items()} for row in rows)
+    return path
+
+
+def tell(lines: Sequence[str], path: Path) -> None:
+    """Print a summary and where its rows lie."""
+    print(*lines, f"rows: {path.relative_to(ROOT)}", sep="\n")
+
+
+def cpu_model() -> str:
+    """As the kernel calls it; where it does not say, as Python does."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
+    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return named[0] if named else platform.processor() or platform.machine()
+
+
+def commit() -> str:
+    """The git commit, with "+" where files differ from it; "unknown" outside a clone."""
+    described = subprocess.run(
+        ["git", "describe", "--always", "--dirty=+", "--exclude=*"],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    return described.stdout.strip() or "unknown"
+
+
+def _short(value: object) -> object:
+    """Numbers as a person reads them."""
+    return f"{value:.4g}" if isinstance(value, float) else value
