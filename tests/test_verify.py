@@ -1,0 +1,176 @@
+"""Evidence, case by case as it was built: on the scene, seen through, hidden, never looked at; and how it is judged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from scanfind.cloud import PointChunk
+from scanfind.find import PRESETS
+from scanfind.library import joint_table
+from scanfind.model import Model, ModelParameters, build_model
+from scanfind.pose import Pose
+from scanfind.recognise import Candidate, Recognition
+from scanfind.refine import Refined
+from scanfind.scene import Scene, build_scene
+from scanfind.search import Hypotheses, model_arrays
+from scanfind.simulate.parts import blocks
+from scanfind.surface import SurfaceParameters
+from scanfind.surfels import GridParameters, MomentGrid
+from scanfind.verify import distinct
+
+Floats = NDArray[np.float64]
+
+CELL = 0.02
+PARAMETERS = replace(PRESETS["default"], grid=GridParameters(cell_m=CELL))
+BOX_M, BOX_AT, WALL_AT = 0.4, 2.0, 4.0
+# The scanner is at zero and looks along x, ± 30 degrees both ways, at a beam every 0.15 degrees.
+HALF_VIEW = np.tan(np.radians(30.0))
+
+
+@cache
+def box() -> Model:
+    """A cube about its own origin."""
+    half = BOX_M / 2
+    mesh = blocks("box", [((-half, -half, -half), (half, half, half))])
+    return build_model(mesh, ModelParameters(SurfaceParameters(samples=600)))
+
+
+@cache
+def scene(known: bool = True, noise: float = 0.0) -> Scene:
+    """A box in front of a wall; `known`: where the scanner stood."""
+    v, w = (side.ravel() for side in np.meshgrid(*[np.linspace(-HALF_VIEW, HALF_VIEW, 441)] * 2))
+    face = BOX_AT - BOX_M / 2
+    x = np.where((np.abs(v * face) <= BOX_M / 2) & (np.abs(w * face) <= BOX_M / 2), face, WALL_AT)
+    x = x + np.random.default_rng(0).normal(scale=noise, size=len(x))
+    grid = MomentGrid(CELL, np.zeros(3))
+    grid.add(
+        PointChunk(np.stack([x, v * x, w * x], axis=1), {}, np.arange(len(x)), origin=np.zeros(3) if known else None)
+    )
+    return build_scene(grid, box().diameter, PARAMETERS.grid, PARAMETERS.search.test_cells_across, 1)
+
+
+def weigh(place: tuple[float, float, float], turn: Floats | None = None, known: bool = True) -> Candidate:
+    """The evidence for a box at a place."""
+    models = [box()]
+    found = Recognition(scene(known), models, joint_table(models), PARAMETERS, 0, 1)
+    rotation = np.eye(3) if turn is None else turn
+    pose = Hypotheses(np.zeros(1, np.int64), rotation[None], np.array([place]), np.ones(1))
+    return found.candidates(Refined(pose, np.eye(6)[None], np.ones(1), np.zeros(1)))[0]
+
+
+def facing(place: tuple[float, float, float]) -> int:
+    """How many samples of a box there face the scanner well enough to return a beam."""
+    points, normals = box().samples.points + np.array(place), box().samples.normals
+    towards = -(points * normals).sum(axis=1) / np.linalg.norm(points, axis=1)
+    return int(np.count_nonzero(towards >= PARAMETERS.verify.least_facing))
+
+
+ON_THE_BOX = (BOX_AT, 0.0, 0.0)
+
+
+def test_on_the_box_its_front_is_supported_and_nothing_seen_through() -> None:
+    seen = weigh(ON_THE_BOX).evidence
+    front = np.count_nonzero(box().samples.normals[:, 0] < -0.9)
+    assert seen.samples == len(box().samples)
+    assert seen.seen_through == 0
+    # The outermost cells have too few neighbours for a normal.
+    assert 0.85 * front <= seen.supported <= front
+    assert seen.supported + seen.hidden <= facing(ON_THE_BOX)
+    assert seen.rms < 1e-4
+    assert seen.visible_support() == 1.0
+    assert seen.support() == seen.supported / seen.samples
+    assert (np.diff(seen.claims) > 0).all()
+    claimed = scene().fine.means[seen.claims]
+    np.testing.assert_allclose(claimed[:, 0], BOX_AT - BOX_M / 2, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("place", [(2.0, 0.7, 0.0), (2.5, -0.9, 0.5), (1.0, 0.0, 0.0), (3.2, 1.0, -1.0)])
+def test_in_free_space_all_that_faces_the_scanner_is_seen_through(place: tuple[float, float, float]) -> None:
+    seen = weigh(place).evidence
+    assert seen.seen_through == facing(place) > 0
+    assert (seen.supported, seen.hidden) == (0, 0)
+    assert seen.penalty() == seen.seen_through / seen.samples
+    assert seen.visible_support() == 0.0
+
+
+@pytest.mark.parametrize("place", [(5.0, 0.0, 0.0), (6.0, 1.0, -1.0), (2.6, 0.0, 0.0)])
+def test_behind_something_it_is_hidden(place: tuple[float, float, float]) -> None:
+    # The last is behind the box, in its shadow as seen from the scanner.
+    seen = weigh(place).evidence
+    assert seen.hidden == facing(place) > 0
+    assert (seen.supported, seen.seen_through) == (0, 0)
+
+
+@pytest.mark.parametrize("place", [(2.0, 3.0, 0.0), (-3.0, 0.0, 0.0), (0.5, 0.0, 5.0)])
+def test_where_nobody_looked_there_is_no_evidence(place: tuple[float, float, float]) -> None:
+    seen = weigh(place).evidence
+    assert (seen.supported, seen.seen_through, seen.hidden) == (0, 0, 0)
+    assert seen.visible_support() == 0.0
+
+
+@pytest.mark.parametrize("place", [ON_THE_BOX, (2.0, 0.7, 0.0), (5.0, 0.0, 0.0)])
+def test_without_a_scanner_nothing_is_seen_through_or_hidden(place: tuple[float, float, float]) -> None:
+    blind, known = weigh(place, known=False), weigh(place)
+    assert (blind.evidence.seen_through, blind.evidence.hidden) == (0, 0)
+    # Sides nobody knows: a back may lie on the scene as well, never fewer samples.
+    assert blind.evidence.supported >= known.evidence.supported
+
+
+def test_flush_with_the_wall_its_front_is_supported() -> None:
+    seen = weigh((WALL_AT + BOX_M / 2, 0.8, 0.3)).evidence
+    front = np.count_nonzero(box().samples.normals[:, 0] < -0.9)
+    assert seen.supported == front
+    assert seen.seen_through == 0
+
+
+def test_evidence_is_each_pose_s_own() -> None:
+    models, places = [box()], [ON_THE_BOX, (2.0, 0.7, 0.0), (5.0, 0.0, 0.0), (2.0, 3.0, 0.0)]
+    found = Recognition(scene(), models, joint_table(models), PARAMETERS, 0, 2)
+    poses = Hypotheses(np.zeros(4, np.int64), np.tile(np.eye(3), (4, 1, 1)), np.array(places), np.ones(4))
+    together = found.candidates(Refined(poses, np.zeros((4, 6, 6)), np.ones(4), np.zeros(4)))
+    for one, place in zip(together, places, strict=True):
+        alone = weigh(place).evidence
+        assert one.evidence[:-1] == alone[:-1]
+        np.testing.assert_array_equal(one.evidence.claims, alone.claims)
+
+
+def test_what_is_there_scores_above_what_is_not() -> None:
+    there, hidden, missing = (weigh(p).score for p in (ON_THE_BOX, (5.0, 0.0, 0.0), (2.0, 0.7, 0.0)))
+    assert 0.0 <= missing <= hidden < there <= 1.0
+    assert weigh(ON_THE_BOX, known=False).score <= 1.0
+
+
+# ── one pose of many alike ──
+
+
+@given(st.integers(0, 2**32), st.integers(1, 30), st.integers(1, 8), st.integers(1, 20))
+def test_distinct_poses_are_apart_and_the_first_of_their_group(seed: int, count: int, most: int, in_all: int) -> None:
+    rng = np.random.default_rng(seed)
+    turns = [
+        Pose.from_rotation_vector(rng.normal(scale=0.1, size=3), rng.normal(scale=0.1, size=3)) for _ in range(count)
+    ]
+    arrays, apart = model_arrays([box()]), np.array([0.1])
+    poses = Hypotheses(
+        np.zeros(count, np.int64), np.array([p.rotation for p in turns]), np.array([p.translation for p in turns]),
+        np.ones(count),
+    )  # fmt: skip
+    kept = distinct(poses, arrays, apart, most, in_all).tolist()
+    assert kept == sorted(set(kept))
+    assert 0 in kept
+    assert len(kept) <= min(most, in_all)
+    radius, centre = arrays.radii[0], arrays.centres[0]
+    outline = centre + radius * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+
+    def moved(a: int, b: int) -> float:
+        return float(np.linalg.norm(turns[a].move(outline) - turns[b].move(outline), axis=1).max())
+
+    assert all(moved(a, b) >= 0.1 for a in kept for b in kept if a < b)
+    if len(kept) < min(most, in_all):
+        assert all(any(moved(k, other) < 0.1 for other in kept if other <= k) for k in range(count))
