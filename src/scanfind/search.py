@@ -294,7 +294,9 @@ class Search:
     def _expect(self, drawn: NDArray[np.int64], tested: NDArray[np.int64]) -> None:
         """Add how many right pairs this round tested of an instance of each model that shows `overlap_ratio`."""
         cells, fine, shown = len(self.table.offsets) - 1, self.scene.fine, self.parameters.overlap_ratio
-        share = np.bincount(tested, minlength=cells) / np.maximum(np.bincount(drawn, minlength=cells), 1)
+        count = np.bincount(drawn, minlength=cells)
+        # None of a feature that was not drawn was left out: without this a scan too small for a pair is never done.
+        share = np.where(count > 0, np.bincount(tested, minlength=cells) / np.maximum(count, 1), 1.0)
         for number, model in enumerate(self.models):
             samples, rung_of_pair = len(model.samples), model.pairs.keys // self.pairs.cells_per_rung()
             area = AREA_OF_A_SAMPLE * samples * model.spacing**2
