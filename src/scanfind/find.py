@@ -141,7 +141,9 @@ def find(
         with clock("refine"):
             poses = found.refine(hypotheses)  # 3.4 post-ICP
         with clock("verify"):
-            found.believe(poses)  # support and penalty (Papazov & Burschka 2010), conflicts, self-similar poses
+            found.believe(
+                hypotheses, poses
+            )  # support and penalty (Papazov & Burschka 2010), conflicts, self-similar poses
     tell("search", 1.0, 1.0)
 
     findings.extend(found.detections())

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from scanfind.detection import Detection, Motion, Refused
 from scanfind.pose import Pose
 from scanfind.refine import Refined, icp, shrinking, unobservable
-from scanfind.scene import quiet
 from scanfind.search import AREA_OF_A_SAMPLE, Hypotheses, Search, model_arrays
 from scanfind.symmetry import self_similar
-from scanfind.verify import Evidence, distinct, gather, score, why_refused
+from scanfind.verify import Evidence, distances, distinct, gather, outlines, score, why_refused
 
 if TYPE_CHECKING:
     from scanfind.find import Parameters
@@ -25,6 +24,8 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
+BATCHES = 3  # of hypotheses refined a round, each far from where those before it went
+CLAIM_CELLS = 2  # a detection claims the surfels up to so many cells around those that support its samples
 REFUSED_SHOWN = 3  # of each model: what came closest
 
 
@@ -32,7 +33,8 @@ class Candidate(NamedTuple):
     """A refined pose with what the scene says of it.
 
     rotation (3, 3), translation (3,) : scene_from_model, relative to the grid's offset; hessian (6, 6) : of ICP
-    score : 0 … 1; area : supported surface less what was seen through, each part counted by how much it tells, m², by which conflicting poses are ranked
+    score : 0 … 1; area : supported surface, counted by how much it tells, less what was seen through, m²: by it
+        conflicting poses are ranked
     """
 
     model: int
@@ -62,6 +64,7 @@ class Recognition:
         diameters = np.array([model.diameter for model in models])
         # Poses closer than a thirtieth of the diameter meet in one ICP; after it a hundredth tells them apart.
         self._apart_before, self._apart_after = diameters / 30.0, diameters / 100.0
+        self._drawn_in = diameters / 10.0
         self._similar: dict[int, list[Pose]] = {}
 
     def wants_more(self, seconds: float) -> bool:
@@ -84,12 +87,29 @@ class Recognition:
 
     def refine(self, hypotheses: Hypotheses) -> Refined:
         """ICP of what is distinct among the hypotheses on the coarse surfels; of the best of those on the fine ones."""
-        refine, kept = self.parameters.refine, self.parameters.search.kept
-        first = hypotheses.take(distinct(hypotheses, self.arrays, self._apart_before, kept, 4 * kept))
-        rough = self._icp_coarse(first)
-        better = rough.hypotheses.take(np.argsort(-rough.matched, kind="stable"))
-        best = better.take(distinct(better, self.arrays, self._apart_after, kept // 3, kept))
-        return self._icp_fine(best, refine.fine_samples)
+        kept, met = self.parameters.search.kept, None
+        rough: list[Refined] = []
+        for _ in range(BATCHES):
+            # One good instance passes the test hundreds of times: those poses must not use up the place of the others.
+            batch = hypotheses.take(distinct(hypotheses, self.arrays, self._apart_before, kept, 4 * kept, met))
+            if not len(batch.models):
+                break
+            rough.append(self._icp_coarse(batch))
+            met = joined([r.hypotheses for r in rough])
+            hypotheses = hypotheses.take(self._far_from(hypotheses, met))
+        if met is None:
+            return self._icp_fine(hypotheses)
+        better = met.take(np.argsort(-np.concatenate([r.matched for r in rough]), kind="stable"))
+        return self._icp_fine(better.take(distinct(better, self.arrays, self._apart_after, kept, 2 * kept)))
+
+    def _far_from(self, hypotheses: Hypotheses, met: Hypotheses) -> NDArray[np.intp]:
+        """The hypotheses that would not be drawn to where others went already (indices)."""
+        theirs, placed = outlines(met, self.arrays), outlines(hypotheses, self.arrays)
+        far = [
+            not (distances(placed[k], theirs[met.models == model]) < self._drawn_in[model]).any()
+            for k, model in enumerate(hypotheses.models)
+        ]
+        return np.flatnonzero(far)
 
     def _icp_coarse(self, hypotheses: Hypotheses) -> Refined:
         refine, coarse = self.parameters.refine, self.scene.coarse
@@ -105,10 +125,12 @@ class Recognition:
             self.jobs,
         )
 
-    def _icp_fine(self, hypotheses: Hypotheses, samples: int) -> Refined:
+    def _icp_fine(self, hypotheses: Hypotheses) -> Refined:
         refine, fine = self.parameters.refine, self.scene.fine
         gates = shrinking(refine.fine_gates, refine.fine_iterations, fine.cell)
-        return icp(hypotheses, fine, self.arrays, self.signed, gates, samples, refine.normal_agreement, self.jobs)
+        return icp(
+            hypotheses, fine, self.arrays, self.signed, gates, refine.fine_samples, refine.normal_agreement, self.jobs
+        )
 
     def candidates(self, refined: Refined) -> list[Candidate]:
         """Refined poses with their evidence."""
@@ -127,10 +149,12 @@ class Recognition:
             )  # fmt: skip
         return found
 
-    def believe(self, refined: Refined) -> None:
+    def believe(self, hypotheses: Hypotheses, refined: Refined) -> None:
         """Accept what the evidence carries; of poses that claim one surface, the one that explains most of it.
 
         Papazov & Burschka's conflict graph, solved greedily by the surface a pose explains.
+
+        hypotheses : of the round, to learn how often an instance is hit
         """
         verify, settled = self.parameters.verify, {id(candidate) for candidate in self.believed}
         fresh = []
@@ -145,14 +169,43 @@ class Recognition:
             if self._shares(candidate, claimed):
                 self._refused.append((candidate, "another pose explains more of the same surface"))
                 continue
-            best = candidate if id(candidate) in settled else self._best_of_similar(candidate)
-            if best is not candidate and self._shares(best, claimed):
-                continue  # turned over, it is one we have
+            best = candidate
+            if id(candidate) not in settled:
+                best = self._best_of_similar(candidate)
+                if best is not candidate and self._shares(best, claimed):
+                    continue  # turned over, it is one we have
+                self.search.learn(best.model, self._hits(hypotheses, best), best.evidence.support())
             believed.append(best)
-            claimed[best.evidence.claims] = True
+            self._claim(best, claimed)
         self.believed = believed
         self._refused = closest(self._refused)
         self.search.withdraw(np.flatnonzero(claimed))
+
+    def _claim(self, candidate: Candidate, claimed: NDArray[np.bool_]) -> None:
+        """Mark the surface a pose claims: its samples are too few to name every surfel of it themselves."""
+        from scanfind.kernels.nearest import mark_around
+
+        fine = self.scene.fine
+        mark_around(
+            candidate.evidence.claims, CLAIM_CELLS, fine.cell, fine.hash_keys, fine.hash_values, fine.block_cells,
+            fine.first_surfel, fine.means, claimed,
+        )  # fmt: skip
+
+    def _hits(self, hypotheses: Hypotheses, found: Candidate) -> int:
+        """How many of a round's hypotheses lead to a pose, or to one it is turned onto by the model's symmetry."""
+        placed = Pose(found.rotation, found.translation)
+        poses = [placed, *(placed @ motion for motion in self._similar.get(found.model, []))]
+        theirs = outlines(self._placements(found.model, poses), self.arrays)
+        mine = outlines(hypotheses.take(np.flatnonzero(hypotheses.models == found.model)), self.arrays)
+        return sum(bool((distances(one, theirs) < self._drawn_in[found.model]).any()) for one in mine)
+
+    def _placements(self, model: int, poses: Sequence[Pose]) -> Hypotheses:
+        """Poses of one model as hypotheses."""
+        count = len(poses)
+        return Hypotheses(
+            np.full(count, model), np.array([p.rotation for p in poses]), np.array([p.translation for p in poses]),
+            np.ones(count),
+        )  # fmt: skip
 
     def _shares(self, candidate: Candidate, claimed: NDArray[np.bool_]) -> bool:
         """Is too much of what supports a pose claimed by others already?"""
@@ -170,12 +223,8 @@ class Recognition:
         others = [placed @ motion for motion in self._similar[number]]
         if not others:
             return candidate
-        count = len(others)
-        turned = Hypotheses(
-            np.full(count, number), np.array([p.rotation for p in others]), np.array([p.translation for p in others]),
-            np.ones(count),
-        )  # fmt: skip
-        refined = self._icp_fine(self._icp_coarse(turned).hypotheses, self.parameters.refine.fine_samples)
+        turned = self._placements(number, others)
+        refined = self._icp_fine(self._icp_coarse(turned).hypotheses)
         return max([candidate, *self.candidates(refined)], key=lambda c: c.area)
 
     def detections(self) -> list[Detection]:
@@ -216,8 +265,10 @@ class Recognition:
     def noise(self) -> float:
         """Spread of the raw points about the surfels that support what was found (or about all), metres."""
         claims = [c.evidence.claims for c in self.believed]
-        flatness = self.scene.fine.flatness[np.concatenate(claims)] if claims else self.scene.fine.flatness
-        return quiet(flatness)
+        if not claims:
+            return self.scene.noise
+        # Their flatter quarter: edges and bends spread the points of most surfels of a part as well.
+        return max(float(np.quantile(self.scene.fine.flatness[np.concatenate(claims)], 0.25)), 0.5 * self.scene.noise)
 
     def notes(self) -> list[str]:
         """What a user should know about how far the answer may be trusted."""
@@ -230,6 +281,12 @@ class Recognition:
             chance = self.search.chance_missed()
             told.append(f"the time limit ended the search; an instance may have been missed with chance {chance:.0%}")
         return told
+
+
+def joined(parts: Sequence[Hypotheses]) -> Hypotheses:
+    """Several lists of hypotheses as one."""
+    models, rotations, translations, support = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Hypotheses(models, rotations, translations, support)
 
 
 def closest(refused: list[tuple[Candidate, str]]) -> list[tuple[Candidate, str]]:

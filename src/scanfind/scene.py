@@ -106,8 +106,10 @@ def build_scene(
 
 
 def quiet(flatness: Floats) -> float:
-    """The noise in some surfels' flatness, metres: their flatter quarter. Edges and bends spread the rest."""
-    return float(np.quantile(flatness, 0.25)) if len(flatness) else 0.0
+    """The noise in some surfels' flatness, metres: its median. Edges and bends spread the upper half, and quantised
+    ranges (a Kinect's) lie in one plane in much of the lower.
+    """
+    return float(np.median(flatness)) if len(flatness) else 0.0
 
 
 def flatness_around(fine: Surfels, around: Surfels) -> Floats:

@@ -30,14 +30,16 @@ FACING_ORIGINS = 6
 # Directions on the sphere a second point is sought in, drawn once: 0.4 MB stay in the cache, where a sine and a cosine
 # a try would cost more than the look-up they lead to.
 DIRECTIONS = 1 << 14
+PARTNERS_COUNTED = 40  # surfels whose partners are counted, each against all of the pool
 # Bins a pair distance: a try takes any surfel of the bin a direction leads to (kernels.search.draw_pairs).
 BINS_A_DISTANCE = 6
 # Borders between classes of bend, in shares of the window: range noise of 2 mm on a plane is below the first for
 # windows over 0.1 m, a pipe as wide as the window above the last.
 BEND_BORDERS = (0.02, 0.05, 0.1)
 # A pair that lies on an instance finds it when noise left its feature in the right cell of the hash table and one of
-# the model's pairs there is near enough: measured 0.1 – 0.4 on shop scenes; the low end.
-RIGHT_PAIR_FINDS = 0.1
+# the model's pairs there is near enough: measured 0.3 – 1
+# on shop scenes, 0.1 on a pump. Only until an instance is found; then it is counted (Search.learn).
+RIGHT_PAIR_FINDS = 0.2
 
 
 @dataclass(frozen=True)
@@ -64,12 +66,12 @@ class SearchParameters:
     kept : hypotheses refined each round, for each model
     """
 
-    overlap_ratio: float = 0.25
+    overlap_ratio: float = 0.3
     time_limit_s: float | None = 60.0
     miss_probability: float = 0.01
     max_instances: int | None = None
-    pairs_a_round: int = 50_000
-    hypotheses_a_round: int = 400_000
+    pairs_a_round: int = 100_000
+    hypotheses_a_round: int = 200_000
     facing_only: bool = True
     by_shape: bool = True
     telling_first: bool = True
@@ -84,7 +86,8 @@ class SearchParameters:
 class ModelArrays(NamedTuple):
     """The samples of all models sought, end to end.
 
-    starts : (models+1,) int64; points, normals : (N, 3); samples : (N, 6) float32, both side by side; centres (models, 3), radii (models,) : of the samples, metres
+    starts : (models+1,) int64; points, normals : (N, 3); samples : (N, 6) float32, both side by
+        side; centres (models, 3), radii (models,) : of the samples, metres
     """
 
     starts: NDArray[np.int64]
@@ -172,6 +175,7 @@ class Search:
         self.rounds = 0
         self.drawn = self.tested = self.hypotheses = self.lookups = 0
         self._expected = np.zeros(len(models))
+        self._learned = np.zeros((len(models), 2))  # hits, and what was shown, of the instances found
         self._unsigned = not (scene.fine.signed and all(m.signed for m in models))
         # A right hypothesis puts λs of its samples on the scene, and chance some of the others.
         wanted = parameters.overlap_ratio
@@ -216,8 +220,17 @@ class Search:
 
     def chance_missed(self) -> float:
         """Chance to have missed an instance that shows λs of its surface, for the model worst served so far."""
-        left = self._expected[~self.done]
+        expected = np.where(self._learned[:, 1] > 0.0, self.rounds * self._rate(), self._expected)
+        left = expected[~self.done]
         return exp(-float(left.min())) if len(left) else 0.0
+
+    def learn(self, model: int, hits: int, support: float) -> None:
+        """Learn from an instance how often a round hits one: pairs on it go with the square of what it shows."""
+        self._learned[model] += hits, (support / self.parameters.overlap_ratio) ** 2
+
+    def _rate(self) -> Floats:
+        """Hits a round of an instance of each model that shows λs of its surface, from what was found, (models,)."""
+        return np.asarray(self._learned[:, 0] / np.maximum(self._learned[:, 1], 1e-300))
 
     def round(self) -> Hypotheses:
         """One round: draw pairs, look them up, test their hypotheses; the best of each pair that pass, best first."""
@@ -234,8 +247,9 @@ class Search:
             test_pairs(
                 start, stop, first, second, signs, keys, fine.means, fine.normals,
                 table.offsets, table.model, table.first, table.second, arrays.starts, arrays.points, arrays.normals,
-                arrays.samples, self.done, self.parameters.normal_length_m, tolerant.cell, tolerant.hash_keys, tolerant.hash_values,
-                tolerant.occupied, tolerant.masks, self._least_hits, self._origins, support, models, rotations, translations, work,
+                arrays.samples, self.done, self.parameters.normal_length_m, tolerant.cell, tolerant.hash_keys,
+                tolerant.hash_values, tolerant.occupied, tolerant.masks, self._least_hits, self._origins,
+                support, models, rotations, translations, work,
             )  # fmt: skip
             return work
 
@@ -321,7 +335,7 @@ class Search:
 
         bins = self._bins[rung]
         if bins.partners < 0.0:
-            some = self.pool[:: max(1, len(self.pool) // 100)]
+            some = self.pool[:: max(1, len(self.pool) // PARTNERS_COUNTED)]
             found = count_partners(
                 some, self.pool, self.scene.fine.means, rung_distance(rung, self.pairs), self._tolerance
             )

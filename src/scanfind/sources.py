@@ -100,7 +100,7 @@ def chunks_of(cloud: PointCloud, chunk_points: int = CHUNK_POINTS) -> Iterator[P
         columns = {name: column[start : start + len(xyz)] for name, column in cloud.attributes.items()}
         # One pass over the sum: it is finite only where every coordinate is.
         with np.errstate(invalid="ignore", over="ignore"):
-            finite = np.isfinite(xyz.sum(axis=1))
+            finite = np.isfinite(xyz @ np.ones(3))
         if finite.all():
             yield PointChunk(xyz, columns, index, 0, origin)
         else:

@@ -7,7 +7,7 @@ their pooled covariance its normals by PCA (3.2); moments add, so levels, chunks
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,8 @@ Ints = NDArray[np.int64]
 DEPTH_PIXELS = 360  # along an edge of the cube map: 0.25° a pixel, 35 mm at 8 m
 # Where a scan has fewer beams than pixels, pixels are joined until most of what was looked at has a range.
 MOST_HOLES, LEAST_DEPTH_PIXELS = 0.15, 45
-EMPTY_BLOCKS, EMPTY_ROWS = 1024, 1 << 16
+# Room to begin with: 32 MB and 109 MB of addresses, of which only what is written becomes memory.
+EMPTY_BLOCKS, EMPTY_ROWS = 1 << 14, 1 << 20
 ROWS_AT_ONCE = 64  # what one block may ask for (kernels.grid.sum_children)
 
 
@@ -75,7 +76,8 @@ class Surfels(NamedTuple):
 
     def has_normal(self) -> NDArray[np.bool_]:
         """Which surfels have a normal, (S,)."""
-        return np.asarray((self.normals != 0.0).any(axis=1))
+        x, y, z = self.normals.T
+        return np.asarray((x != 0.0) | (y != 0.0) | (z != 0.0))
 
 
 class DepthMap(NamedTuple):
@@ -152,17 +154,17 @@ class MomentGrid:
         self.unaddressable = int(self._counts[2])
 
     def _make_room(self) -> None:
-        """Double whichever array is full: allocating for the worst case cost more than the pass itself."""
+        """Double whichever array is full; copied is only what is in use."""
         from scanfind.kernels.blocks import fill_hash
 
         if self._counts[0] + 1 > len(self._block_keys):
-            self._block_keys = np.concatenate([self._block_keys, np.empty_like(self._block_keys)])
-            self._block_cells = np.concatenate([self._block_cells, np.empty_like(self._block_cells)])
+            self._block_keys = doubled(self._block_keys)
+            self._block_cells = doubled(self._block_cells)
             self._hash_keys = np.full(4 * len(self._block_keys), -1, np.int64)
             self._hash_values = np.zeros(len(self._hash_keys), np.int32)
             fill_hash(self._block_keys[: self._counts[0]], self._hash_keys, self._hash_values)
         if self._counts[1] + ROWS_AT_ONCE > len(self._moments):
-            self._moments = np.concatenate([self._moments, np.empty_like(self._moments)])
+            self._moments = doubled(self._moments)
 
     def points_per_row(self) -> float:
         """Raw points a cell, on average, counting a cell once for each octant it was seen from."""
@@ -213,26 +215,38 @@ class MomentGrid:
         first_cell = np.concatenate([[0], np.cumsum(count_cells(slot_starts, slot_cells))])
         cells = int(first_cell[-1])
         block_cells = np.empty((len(block_keys), 512), np.int32)
-        cell_locals, totals = np.empty(cells, np.int16), np.empty((cells, 13), np.int64)
+        cell_locals, totals = np.empty(cells, np.int16), np.empty((cells, 10), np.float32)
         number_cells(slot_starts, slot_cells, first_cell, self._moments, block_cells, cell_locals, totals)
 
         sides = np.empty(cells, np.int64)
-        means, normals = np.empty((cells, 2, 3)), np.empty((cells, 2, 3))
-        flatness, points = np.empty((cells, 2)), np.empty((cells, 2))
+        # The face first met, and the other one, which few cells have: its arrays stay addresses without memory.
+        front, back = (np.empty((cells, 8)) for _ in range(2))
         in_threads(
             jobs, len(block_keys),
             lambda start, stop: fit_surfels(
                 start, stop, block_keys, hash_keys, hash_values, slot_starts, slot_cells, self._moments, block_cells,
                 first_cell, cell_locals, totals, self.cell, self._units, min_neighbours,
-                sides, means, normals, flatness, points,
+                sides, front, back,
             ),
         )  # fmt: skip
-        kept = np.arange(2) < sides[:, None]
+        first_surfel = np.concatenate([[0], np.cumsum(sides)])
+        fitted = front
+        if first_surfel[-1] > cells:
+            fitted, two = np.empty((first_surfel[-1], 8)), sides == 2
+            fitted[first_surfel[:-1]] = front
+            fitted[first_surfel[:-1][two] + 1] = back[two]
         return Surfels(
             self.cell, np.zeros(3) if self.offset is None else self.offset, hash_keys, hash_values, block_keys,
-            block_cells, np.concatenate([[0], np.cumsum(sides)]).astype(np.int32), means[kept], normals[kept],
-            flatness[kept], points[kept], self.signed,
+            block_cells, first_surfel.astype(np.int32), np.ascontiguousarray(fitted[:, :3]),
+            np.ascontiguousarray(fitted[:, 3:6]), fitted[:, 6].copy(), fitted[:, 7].copy(), self.signed,
         )  # fmt: skip
+
+
+def doubled(array: NDArray[Any]) -> NDArray[Any]:
+    """Twice the room along the first axis; the new half is left untouched, so that it costs no memory yet."""
+    larger = np.empty((2 * len(array), *array.shape[1:]), array.dtype)
+    larger[: len(array)] = array
+    return larger
 
 
 def empty_hash(entries: int) -> tuple[Ints, NDArray[np.int32]]:

@@ -56,7 +56,7 @@ class VerifyParameters:
 
 # Share of a model's surface that scans from a few sides show: full marks where nothing tells hidden from missing.
 EXPECTED_BLIND = 0.5
-BELIEVED_SUPPORT = 0.05
+BELIEVED_SUPPORT = 0.08
 
 
 class Evidence(NamedTuple):
@@ -108,12 +108,14 @@ def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters) -
     least = parameters.min_support_blind if blind else parameters.min_support
     if evidence.support() < least:
         return f"only {evidence.support():.0%} of its surface lies on the scan, {least:.0%} is asked for"
-    if score(evidence, blind, parameters) < parameters.min_score:
-        if blind:
-            return f"{evidence.support():.0%} of its surface lies on the scan, and no free space is known to tell more"
-        share = 1.0 - evidence.visible_support()
-        return f"beams passed through {share:.0%} of the surface that scanners should have seen"
-    return ""
+    if score(evidence, blind, parameters) >= parameters.min_score:
+        return ""
+    if blind:
+        return f"{evidence.support():.0%} of its surface lies on the scan, and no free space is known to tell more"
+    missing = 1.0 - evidence.visible_support()
+    if 1.0 - missing * parameters.penalty_weight < parameters.min_score:
+        return f"beams passed through {missing:.0%} of the surface that scanners should have seen"
+    return "what lies on the scan is too little, or of a shape the scan is full of (floors, walls), to tell"
 
 
 def gather(
@@ -157,26 +159,42 @@ def gather(
     return found
 
 
-def distinct(hypotheses: Hypotheses, arrays: ModelArrays, apart: Floats, most: int, in_all: int) -> NDArray[np.intp]:
+def distinct(
+    hypotheses: Hypotheses, arrays: ModelArrays, apart: Floats, most: int, in_all: int, known: Hypotheses | None = None
+) -> NDArray[np.intp]:
     """The first of each group of poses that nearly coincide (indices), at most `most` of each model and `in_all`.
 
         apart : (models,) metres; poses that move no point of the model's outline farther than this are one
+        known : poses whose groups are left out
 
     Thousands of poses that roll about a straight pipe pass the sequential test; one of each group is refined.
     """
-    corners = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     kept: list[int] = []
-    outlines: dict[int, list[Floats]] = {}
-    for k, model in enumerate(hypotheses.models.tolist()):
+    near: dict[int, list[Floats]] = {}
+    if known is not None:
+        for model, outline in zip(known.models.tolist(), outlines(known, arrays), strict=True):
+            near.setdefault(model, []).append(outline)
+    taken = dict.fromkeys(range(len(apart)), 0)
+    for k, outline in enumerate(outlines(hypotheses, arrays)):
+        model = int(hypotheses.models[k])
         if len(kept) >= in_all:
             break
-        near = outlines.setdefault(model, [])
-        if len(near) >= most:
+        met = near.setdefault(model, [])
+        if taken[model] >= most or (met and (distances(outline, np.array(met)) < apart[model]).any()):
             continue
-        points = arrays.centres[model] + arrays.radii[model] * corners
-        outline = points @ hypotheses.rotations[k].T + hypotheses.translations[k]
-        if near and (np.linalg.norm(np.array(near) - outline, axis=2).max(axis=1) < apart[model]).any():
-            continue
-        near.append(outline)
+        met.append(outline)
+        taken[model] += 1
         kept.append(k)
     return np.array(kept, np.intp)
+
+
+def outlines(hypotheses: Hypotheses, arrays: ModelArrays) -> Floats:
+    """Seven points of each placed model, (H, 7, 3): its centre, and its radius away along each axis."""
+    corners = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    points = arrays.centres[hypotheses.models][:, None] + arrays.radii[hypotheses.models][:, None, None] * corners
+    return np.asarray(np.einsum("hij,hkj->hki", hypotheses.rotations, points) + hypotheses.translations[:, None])
+
+
+def distances(outline: Floats, others: Floats) -> Floats:
+    """How far a pose moves the farthest of its seven points from another's, (H,), metres."""
+    return np.asarray(np.linalg.norm(others - outline, axis=2).max(axis=1))

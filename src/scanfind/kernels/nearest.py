@@ -51,3 +51,27 @@ def nearest_surfel(
                         continue
                     best, nearest = s, squared
     return best
+
+
+@njit(cache=True, nogil=True)
+def mark_around(some, reach, cell, hash_keys, hash_values, block_cells, first_surfel, means, marked):
+    """Mark all surfels in the cells up to `reach` cells from some surfels' own; marked : (S,) bool, in place."""
+    inverse = 1.0 / cell
+    for i in range(some.shape[0]):
+        cx = np.int64(floor(means[some[i], 0] * inverse))
+        cy = np.int64(floor(means[some[i], 1] * inverse))
+        cz = np.int64(floor(means[some[i], 2] * inverse))
+        key, block = np.int64(-1), np.int64(-1)
+        for ix in range(cx - reach, cx + reach + 1):
+            for iy in range(cy - reach, cy + reach + 1):
+                for iz in range(cz - reach, cz + reach + 1):
+                    here = pack_block(ix >> 3, iy >> 3, iz >> 3)
+                    if here != key:
+                        key = here
+                        block = find_block(hash_keys, hash_values, key)
+                    if block < 0:
+                        continue
+                    found = block_cells[block, ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7)]
+                    if found >= 0:
+                        for s in range(first_surfel[found], first_surfel[found + 1]):
+                            marked[s] = True

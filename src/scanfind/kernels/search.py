@@ -123,6 +123,10 @@ def mark_orientations(means, normals, reach, cell, spread, signed, hash_keys, ha
     Returns the surfel it stopped at because blocks ran out, else their number.
     """
     inverse = 1.0 / cell
+    c, s = cos(spread), sin(spread)
+    ring = np.empty((8, 2))
+    for k in range(8):
+        ring[k, 0], ring[k, 1] = s * cos(k * pi / 4.0), s * sin(k * pi / 4.0)
     for i in range(counts[1], means.shape[0]):
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         if nx == 0.0 and ny == 0.0 and nz == 0.0:
@@ -139,9 +143,8 @@ def mark_orientations(means, normals, reach, cell, spread, signed, hash_keys, ha
         ux, uy, uz = ux / size, uy / size, uz / size
         vx, vy, vz = ny * uz - nz * uy, nz * ux - nx * uz, nx * uy - ny * ux
         mask = normal_bit(nx, ny, nz)
-        c, s = cos(spread), sin(spread)
         for k in range(8):
-            p, q = s * cos(k * pi / 4.0), s * sin(k * pi / 4.0)
+            p, q = ring[k, 0], ring[k, 1]
             x, y, z = c * nx + p * ux + q * vx, c * ny + p * uy + q * vy, c * nz + p * uz + q * vz
             mask |= normal_bit(x, y, z)
             if not signed:

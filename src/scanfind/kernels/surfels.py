@@ -8,7 +8,6 @@ import numpy as np
 from numba import njit
 
 from scanfind.kernels.blocks import find_block, pack_block, unpack_block
-from scanfind.kernels.grid import MOMENTS
 
 
 @njit(cache=True, nogil=True)
@@ -69,7 +68,7 @@ def number_cells(slot_starts, slot_cells, first_cell, moments, block_cells, cell
     """Number the cells block by block and sum their octants.
 
     block_cells : (B, 512) out: number of each cell, -1 for empty
-    totals : (V, 13) out: moments of each cell, all octants together
+    totals : (V, 10) float32 out: n, Σx, Σxxᵀ of each cell, all octants together; 40 bytes that the 27 cells around read
     """
     for block in range(slot_starts.shape[0] - 1):
         cell = first_cell[block]
@@ -79,11 +78,9 @@ def number_cells(slot_starts, slot_cells, first_cell, moments, block_cells, cell
             for slot in range(slot_starts[block], slot_starts[block + 1]):
                 row = slot_cells[slot, local]
                 if row >= 0:
-                    if not occupied:
-                        totals[cell, :] = moments[row]
-                        occupied = True
-                    else:
-                        totals[cell] += moments[row]
+                    for k in range(10):
+                        totals[cell, k] = moments[row, k] + (totals[cell, k] if occupied else 0.0)
+                    occupied = True
             if occupied:
                 block_cells[block, local] = cell
                 cell_locals[cell] = local
@@ -104,9 +101,6 @@ def add_moved(pool, table, row, ex, ey, ez):
     pool[7] += table[row, 7] + 2.0 * ey * sy + n * ey * ey
     pool[8] += table[row, 8] + ey * sz + ez * sy + n * ey * ez
     pool[9] += table[row, 9] + 2.0 * ez * sz + n * ez * ez
-    pool[10] += table[row, 10]
-    pool[11] += table[row, 11]
-    pool[12] += table[row, 12]
 
 
 @njit(cache=True, nogil=True)
@@ -121,23 +115,30 @@ def plane_of(pool):
 
 
 @njit(cache=True, nogil=True)
+def write_fit(fits, c, x, y, z, nx, ny, nz, variance, unit, points):
+    """Write one surfel: mean, normal, spread across its plane (variance is in offset units), points."""
+    fits[c, 0], fits[c, 1], fits[c, 2] = x, y, z
+    fits[c, 3], fits[c, 4], fits[c, 5] = nx, ny, nz
+    fits[c, 6], fits[c, 7] = sqrt(max(variance, 0.0)) * unit, points
+
+
+@njit(cache=True, nogil=True)
 def fit_surfels(
     first_block, last_block, block_keys, hash_keys, hash_values, slot_starts, slot_cells, moments,
     block_cells, first_cell, cell_locals, totals, cell, units, min_neighbours,
-    n_sides, means, normals, flatness, weights,
+    n_sides, front_fits, back_fits,
 ):  # fmt: skip
     """Fit one or two surfels in every cell of some blocks.
 
     cell : edge, metres; units : offset units a cell
     min_neighbours : occupied cells of the 3×3×3 a normal needs, the cell itself included
     n_sides : (V,) out: 1, or 2 where the scanners saw both faces of something thin
-    means : (V, 2, 3) out: metres from the grid's offset
-    normals : (V, 2, 3) out: unit, towards the scanner; zero where there are too few neighbours
-    flatness : (V, 2) out: standard deviation across the pooled plane, metres; weights : (V, 2) out: points
+    front_fits, back_fits : (V, 8) out: mean (3), metres from the grid's offset; normal (3), unit, towards the scanner,
+        zero where there are too few neighbours; standard deviation across the pooled plane, metres; points
     """
     unit = cell / units
-    pool = np.zeros(MOMENTS)
-    side = np.zeros(MOMENTS)
+    pool = np.zeros(10)
+    side = np.zeros(10)
     around = np.empty(27, np.int64)
     neighbour_cell = np.empty(27, np.int64)
     neighbour_block = np.empty(27, np.int64)
@@ -172,11 +173,12 @@ def fit_surfels(
             cx, cy, cz = ((bx << 3) + lx + 0.5) * cell, ((by << 3) + ly + 0.5) * cell, ((bz << 3) + lz + 0.5) * cell
 
             # A thin plate scanned from both sides: the sums of directions of its octants disagree about the side.
-            front = back = 0.0
+            front = back = toward = 0.0
             for slot in range(slot_starts[block], slot_starts[block + 1]):
                 row = slot_cells[slot, local]
                 if row >= 0:
                     along = moments[row, 10] * nx + moments[row, 11] * ny + moments[row, 12] * nz
+                    toward += along
                     if along > 0.0:
                         front += moments[row, 0]
                     elif along < 0.0:
@@ -184,21 +186,21 @@ def fit_surfels(
             two = occupied >= min_neighbours and min(front, back) >= max(2.0, 0.1 * totals[c, 0])
             n_sides[c] = 2 if two else 1
             if not two:
-                means[c, 0, 0] = cx + totals[c, 1] / totals[c, 0] * unit
-                means[c, 0, 1] = cy + totals[c, 2] / totals[c, 0] * unit
-                means[c, 0, 2] = cz + totals[c, 3] / totals[c, 0] * unit
-                weights[c, 0] = totals[c, 0]
-                flatness[c, 0] = sqrt(max(low, 0.0)) * unit
-                sign = -1.0 if totals[c, 10] * nx + totals[c, 11] * ny + totals[c, 12] * nz < 0.0 else 1.0
+                sign = -1.0 if toward < 0.0 else 1.0
                 if occupied < min_neighbours:
                     sign = 0.0
-                normals[c, 0, 0], normals[c, 0, 1], normals[c, 0, 2] = sign * nx, sign * ny, sign * nz
+                n = totals[c, 0]
+                write_fit(
+                    front_fits, c, cx + totals[c, 1] / n * unit, cy + totals[c, 2] / n * unit,
+                    cz + totals[c, 3] / n * unit, sign * nx, sign * ny, sign * nz, low, unit, n,
+                )  # fmt: skip
                 continue
             for s in range(2):
                 sign = 1.0 - 2.0 * s
                 side[:] = 0.0
                 pool[:] = 0.0
                 occupied = 0
+                toward_x = toward_y = toward_z = 0.0
                 for k in range(27):
                     if neighbour_cell[k] < 0:
                         continue
@@ -210,6 +212,9 @@ def fit_surfels(
                             along = moments[row, 10] * nx + moments[row, 11] * ny + moments[row, 12] * nz
                             if along * sign > 0.0:
                                 seen = True
+                                toward_x += moments[row, 10]
+                                toward_y += moments[row, 11]
+                                toward_z += moments[row, 12]
                                 add_moved(
                                     pool, moments, row, (k // 9 - 1) * units,
                                     (k // 3 % 3 - 1) * units, (k % 3 - 1) * units,
@@ -217,13 +222,12 @@ def fit_surfels(
                                 if k == 13:
                                     add_moved(side, moments, row, 0.0, 0.0, 0.0)
                     occupied += 1 if seen else 0
-                means[c, s, 0] = cx + side[1] / side[0] * unit
-                means[c, s, 1] = cy + side[2] / side[0] * unit
-                means[c, s, 2] = cz + side[3] / side[0] * unit
-                weights[c, s] = side[0]
                 mx, my, mz, low = nx, ny, nz, 0.0
                 if occupied >= min_neighbours:
                     mx, my, mz, low, _, _ = plane_of(pool)
-                flatness[c, s] = sqrt(max(low, 0.0)) * unit
-                flip = -1.0 if pool[10] * mx + pool[11] * my + pool[12] * mz < 0.0 else 1.0
-                normals[c, s, 0], normals[c, s, 1], normals[c, s, 2] = flip * mx, flip * my, flip * mz
+                flip = -1.0 if toward_x * mx + toward_y * my + toward_z * mz < 0.0 else 1.0
+                n = side[0]
+                write_fit(
+                    front_fits if s == 0 else back_fits, c, cx + side[1] / n * unit, cy + side[2] / n * unit,
+                    cz + side[3] / n * unit, flip * mx, flip * my, flip * mz, low, unit, n,
+                )  # fmt: skip
