@@ -56,7 +56,7 @@ class VerifyParameters:
 
 # Share of a model's surface that scans from a few sides show: full marks where nothing tells hidden from missing.
 EXPECTED_BLIND = 0.5
-BELIEVED_SUPPORT = 0.08
+BELIEVED_SUPPORT = 0.065
 
 
 class Evidence(NamedTuple):
