@@ -371,7 +371,9 @@ def test_a_scan_smaller_than_the_object_is_soon_given_up(preset: str) -> None:
     rng = np.random.default_rng(0)
     floor = np.column_stack([rng.uniform(0, 0.3, (20_000, 2)), rng.normal(scale=0.001, size=20_000)])
     base = PRESETS[preset]
-    parameters = replace(base, grid=QUICK.grid, surface=QUICK.surface, search=replace(base.search, time_limit_s=1.0))
+    parameters = replace(
+        base, grid=QUICK.grid, surface=QUICK.surface, search=replace(base.search, time_limit_s=2.0, pairs_a_round=8000)
+    )
     found = find(floor, BRACKET, parameters=parameters, origin=[0.1, 0.1, 2.0])
     assert list(found) == []
     if preset == "default":
