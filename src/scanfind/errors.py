@@ -15,6 +15,13 @@ class UsageError(ScanfindError):
     exit_code = 2
 
 
+def require(holds: bool, name: str, value: object, wanted: str) -> None:
+    """Raise UsageError "name must be …, got …" unless a parameter holds to what is wanted of it."""
+    if not holds:
+        msg = f"{name} must be {wanted}, got {value}"
+        raise UsageError(msg)
+
+
 class InvalidGeometryError(ScanfindError):
     """An array, mesh or pose of the wrong shape or with impossible values (no triangle, no extent, NaN)."""
 

@@ -16,9 +16,10 @@ from numpy.typing import ArrayLike
 from scanfind.cloud import CloudModel, PointChunk, shift_for
 from scanfind.detection import Findings
 from scanfind.deviation import deviation_of
-from scanfind.errors import UsageError
+from scanfind.errors import UsageError, require
 from scanfind.isolate import IsolateParameters, Placed
 from scanfind.isolate import isolate as isolate_raw
+from scanfind.kernels import COMPILE_S, compiled
 from scanfind.library import ModelLibrary, joint_table
 from scanfind.mesh import Mesh
 from scanfind.model import Model, ModelParameters
@@ -54,6 +55,12 @@ class IsolationParameters:
 
     tolerance_m: float | None = None
     noises: float = 4.0
+
+    def __post_init__(self) -> None:
+        require(
+            self.tolerance_m is None or self.tolerance_m > 0.0, "tolerance_m", self.tolerance_m, "a positive length"
+        )
+        require(self.noises > 0.0, "noises", self.noises, "more than 0")
 
 
 @dataclass(frozen=True)
@@ -117,6 +124,9 @@ def find(
     parameters, jobs = parameters or PRESETS["default"], jobs or available_cores()
     clock, tell = Clock(), progress or (lambda stage, done, total: None)
     findings = Findings()
+
+    if not compiled():
+        tell("compile", 0.0, COMPILE_S)  # once a machine; whoever listens can say so
 
     with clock("read"):
         sources = Sources(scans, origin)

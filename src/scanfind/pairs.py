@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.cloud import OrientedCloud
-from scanfind.errors import InvalidGeometryError
+from scanfind.errors import InvalidGeometryError, require
 
 SHORTEST_M = 1e-3  # the ladder's foot; nothing smaller is sought with a laser scanner
 OCTAVES = 17  # … and its top: 2^17 mm = 131 m
@@ -38,6 +38,15 @@ class PairParameters:
     rungs_per_octave: int = 4
     tolerance: float = 0.5
     angle_cell_deg: float = 12.0
+
+    def __post_init__(self) -> None:
+        require(
+            len(self.distances) > 0 and all(0.0 < share <= 1.0 for share in self.distances),
+            "distances", self.distances, "shares of the diameter, above 0 and at most 1",
+        )  # fmt: skip
+        require(1 <= self.rungs_per_octave <= 64, "rungs_per_octave", self.rungs_per_octave, "from 1 to 64")
+        require(self.tolerance > 0.0, "tolerance", self.tolerance, "more than 0 spacings")
+        require(3.0 <= self.angle_cell_deg <= 90.0, "angle_cell_deg", self.angle_cell_deg, "from 3 to 90 degrees")
 
     def angle_bins(self) -> int:
         """Cells along each of the three angles."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.detection import Motion
+from scanfind.errors import require
 from scanfind.search import Hypotheses, ModelArrays
 from scanfind.threads import in_threads
 
@@ -37,6 +38,13 @@ class RefineParameters:
     fine_gates: tuple[float, float] = (1.2, 0.5)
     normal_agreement: float = 0.7
     unobservable_below: float = 0.004
+
+    def __post_init__(self) -> None:
+        for name in ("coarse_iterations", "fine_iterations", "coarse_samples", "fine_samples"):
+            require(getattr(self, name) >= 1, name, getattr(self, name), "1 or more")
+        for name in ("coarse_gates", "fine_gates"):
+            require(min(getattr(self, name)) > 0.0, name, getattr(self, name), "two positive numbers of cells")
+        require(0.0 <= self.normal_agreement <= 1.0, "normal_agreement", self.normal_agreement, "from 0 to 1")
 
 
 class Refined(NamedTuple):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.errors import require
 from scanfind.pairs import rung_distance, rungs_of
 from scanfind.surfels import empty_hash
 from scanfind.threads import in_threads
@@ -81,6 +82,21 @@ class SearchParameters:
     chance_overlap: float = 0.15
     test_cells_across: float = 45.0
     kept: int = 48
+
+    def __post_init__(self) -> None:
+        require(0.0 < self.overlap_ratio <= 1.0, "overlap_ratio", self.overlap_ratio, "above 0 and at most 1")
+        limit = self.time_limit_s
+        require(limit is None or limit > 0.0, "time_limit_s", limit, "more than 0 seconds")
+        require(0.0 <= self.miss_probability < 1.0, "miss_probability", self.miss_probability, "from 0 to below 1")
+        require(
+            limit is not None or self.miss_probability > 0.0, "time_limit_s", limit, "given where miss_probability is 0"
+        )
+        require(self.max_instances is None or self.max_instances >= 1, "max_instances", self.max_instances, "1 or more")
+        require(0.0 < self.chance_overlap < 0.5, "chance_overlap", self.chance_overlap, "above 0 and below 0.5")
+        require(self.normal_length_m >= 0.0, "normal_length_m", self.normal_length_m, "0 or more metres")
+        require(self.test_cells_across >= 4.0, "test_cells_across", self.test_cells_across, "4 or more")
+        for name in ("pairs_a_round", "hypotheses_a_round", "max_tries", "tests", "kept"):
+            require(getattr(self, name) >= 1, name, getattr(self, name), "1 or more")
 
 
 class ModelArrays(NamedTuple):

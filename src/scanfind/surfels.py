@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.cloud import PointChunk
+from scanfind.errors import require
 
 if TYPE_CHECKING:
     pass
@@ -45,6 +46,15 @@ class GridParameters:
     least_cells_across: float = 30.0
     points_per_cell: float = 1.25
     min_neighbours: int = 5
+
+    def __post_init__(self) -> None:
+        require(self.cell_m is None or 0.0 < self.cell_m < 100.0, "cell_m", self.cell_m, "a length up to 100 metres")
+        require(self.least_cells_across >= 1.0, "least_cells_across", self.least_cells_across, "1 or more")
+        require(
+            self.cells_across >= self.least_cells_across, "cells_across", self.cells_across, "no less than the least"
+        )
+        require(self.points_per_cell >= 0.0, "points_per_cell", self.points_per_cell, "0 or more")
+        require(1 <= self.min_neighbours <= 27, "min_neighbours", self.min_neighbours, "from 1 to 27")
 
 
 class Surfels(NamedTuple):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.errors import require
 from scanfind.threads import in_threads
 
 if TYPE_CHECKING:
@@ -52,6 +53,14 @@ class VerifyParameters:
     penalty_weight: float = 1.0
     shared: float = 0.2
     alternatives: int = 24
+
+    def __post_init__(self) -> None:
+        for name in ("min_score", "min_support", "min_support_blind", "normal_agreement", "least_facing", "shared"):
+            require(0.0 <= getattr(self, name) <= 1.0, name, getattr(self, name), "from 0 to 1")
+        require(0.0 < self.gate_cells <= 1.0, "gate_cells", self.gate_cells, "above 0 and at most 1")
+        for name in ("inlier_noises", "inlier_cells", "margin_inliers", "margin_cells", "penalty_weight"):
+            require(getattr(self, name) >= 0.0, name, getattr(self, name), "0 or more")
+        require(self.alternatives >= 0, "alternatives", self.alternatives, "0 or more")
 
 
 # Share of a model's surface that scans from a few sides show: full marks where nothing tells hidden from missing.
