@@ -122,6 +122,7 @@ def find(
     Raises ScanfindError: UsageError, UnreadableFileError, InvalidGeometryError, LibraryError …
     """
     parameters, jobs = parameters or PRESETS["default"], jobs or available_cores()
+    require(seed >= 0, "seed", seed, "0 or more")
     clock, tell = Clock(), progress or (lambda stage, done, total: None)
     findings = Findings()
 
@@ -193,6 +194,10 @@ def models_of(
                 for model in read_models(Path(given), units=units, select=select):
                     fresh.add(model, prepare)
         sought.extend(fresh.models())
+    names = [model.name for model in sought]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        msg = f"find: two models are called {twice[0]!r}: rename one, so that detections can be told apart"
+        raise UsageError(msg)
     if not sought:
         msg = "find: no model to look for: the library is empty; add one with `scanfind library add`"
         raise UsageError(msg)

@@ -225,7 +225,8 @@ class Recognition:
             return candidate
         turned = self._placements(number, others)
         refined = self._icp_fine(self._icp_coarse(turned).hypotheses)
-        return max([candidate, *self.candidates(refined)], key=lambda c: c.area)
+        sound = [c for c in self.candidates(refined) if not why_refused(c.evidence, self.blind, self.parameters.verify)]
+        return max([candidate, *sound], key=lambda c: c.area)
 
     def detections(self) -> list[Detection]:
         """What is believed, best first, numbered from 1, in the scans' own frame."""

@@ -318,8 +318,9 @@ class Search:
         key_pairs(
             first, second, signs, fine.means, fine.normals, self.pairs.angle_cell(), self.pairs.angle_bins(), keys
         )
-        keys += rung * self.pairs.cells_per_rung()
-        return first, second, signs, keys
+        pairs = keys >= 0
+        keys[pairs] += rung * self.pairs.cells_per_rung()
+        return first[pairs], second[pairs], signs[pairs], keys[pairs]
 
     def _expect(self, drawn: NDArray[np.int64], tested: NDArray[np.int64]) -> None:
         """Add how many right pairs this round tested of an instance of each model that shows `overlap_ratio`."""
@@ -372,10 +373,10 @@ class Bins(NamedTuple):
 
 def bin_pool(pool: NDArray[np.intp], means: Floats, edge: float) -> Bins:
     """Sort surfels into cubes of an edge in metres."""
-    from scanfind.kernels.blocks import BIAS, fill_hash
+    from scanfind.kernels.blocks import BIAS, VIEW_BITS, fill_hash
 
     x, y, z = (np.floor(means[pool] / edge).astype(np.int64) + BIAS).T
-    keys = (x << 43) | (y << 23) | (z << 3)
+    keys = (x << 44) | (y << 25) | (z << VIEW_BITS)
     order = np.argsort(keys, kind="stable")
     bins, starts = np.unique(keys[order], return_index=True)
     hash_keys, hash_values = empty_hash(len(bins))

@@ -26,6 +26,7 @@ DEPTH_PIXELS = 360  # along an edge of the cube map: 0.25° a pixel, 35 mm at 8 
 MOST_HOLES, LEAST_DEPTH_PIXELS = 0.15, 45
 # Room to begin with: 32 MB and 109 MB of addresses, of which only what is written becomes memory.
 EMPTY_BLOCKS, EMPTY_ROWS = 1 << 14, 1 << 20
+POINTS_TO_SETTLE = 1000  # of which the median says where the scan lies
 ROWS_AT_ONCE = 64  # what one block may ask for (kernels.grid.sum_children)
 
 
@@ -117,8 +118,8 @@ class DepthMap(NamedTuple):
 class MomentGrid:
     """Raw points in, surfels out. `add` every chunk, in any order; the result does not depend on it.
 
-    cell : edge of a cell, metres; offset : (3,) float64, the grid's origin in the points' frame (`None`: near the first
-    point, rounded to whole metres, so that coordinates keep their digits however far from zero the scan is).
+    cell : edge of a cell, metres; offset : (3,) float64, the grid's origin in the points' frame (`None`: the median of
+    the first points, rounded to whole metres, so that coordinates keep their digits however far from zero the scan is).
     """
 
     def __init__(self, cell: float, offset: Floats | None = None) -> None:
@@ -134,6 +135,7 @@ class MomentGrid:
         self._block_cells = np.empty((EMPTY_BLOCKS, 512), np.int32)
         self._moments = np.empty((EMPTY_ROWS, 13), np.int64)
         self._counts = np.zeros(3, np.int64)
+        self._held: list[PointChunk] = []
         self._depths: dict[tuple[float, ...], NDArray[np.float32]] = {}
 
     def add(self, chunk: PointChunk) -> None:
@@ -143,7 +145,8 @@ class MomentGrid:
         if not len(chunk):
             return
         if self.offset is None:
-            self.offset = np.round(chunk.xyz[0])
+            self._settle(chunk)
+            return
         has_origin = chunk.origin is not None
         self.signed &= has_origin
         origin = np.zeros(3) if chunk.origin is None else np.asarray(chunk.origin, np.float64)
@@ -163,6 +166,24 @@ class MomentGrid:
         self.points += len(chunk)
         self.unaddressable = int(self._counts[2])
 
+    def _settle(self, chunk: PointChunk) -> None:
+        """Hold chunks back until there are enough points to say where the scan lies; then add what was held.
+
+        The median of the first points, not the first: one stray record would put the whole scan out of reach.
+        """
+        self._held.append(chunk)
+        if sum(len(held) for held in self._held) >= POINTS_TO_SETTLE:
+            self._release()
+
+    def _release(self) -> None:
+        """Add the chunks held back."""
+        held, self._held = self._held, []
+        if self.offset is None and held:
+            first = np.concatenate([chunk.xyz[:POINTS_TO_SETTLE] for chunk in held])[:POINTS_TO_SETTLE]
+            self.offset = np.round(np.median(first, axis=0))
+        for chunk in held:
+            self.add(chunk)
+
     def _make_room(self) -> None:
         """Double whichever array is full; copied is only what is in use."""
         from scanfind.kernels.blocks import fill_hash
@@ -177,13 +198,15 @@ class MomentGrid:
             self._moments = doubled(self._moments)
 
     def points_per_row(self) -> float:
-        """Raw points a cell, on average, counting a cell once for each octant it was seen from."""
+        """Raw points a cell, on average, counting a cell once for each view."""
+        self._release()
         return self.points / max(int(self._counts[1]), 1)
 
     def coarser(self) -> MomentGrid:
         """The next level of the octree: cells of twice the edge, each the sum of its eight children."""
         from scanfind.kernels.grid import sum_children
 
+        self._release()
         parent = MomentGrid(2.0 * self.cell, self.offset)
         parent.points, parent.unaddressable, parent.signed = self.points, self.unaddressable, self.signed
         parent._units = 2.0 * self._units
@@ -202,6 +225,7 @@ class MomentGrid:
 
     def depth_maps(self) -> list[DepthMap]:
         """One for each scanner position, in the order of their coordinates."""
+        self._release()
         maps = [DepthMap(np.array(key), self._depths[key], DEPTH_PIXELS) for key in sorted(self._depths)]
         while maps and maps[0].edge > LEAST_DEPTH_PIXELS and max(depth.holes() for depth in maps) > MOST_HOLES:
             maps = [depth.coarser() for depth in maps]
@@ -209,15 +233,16 @@ class MomentGrid:
 
     def surfels(self, min_neighbours: int = 5, jobs: int = 1) -> Surfels:
         """The mean and the oriented normal of each cell (paper 3.2: PCA over a neighbourhood)."""
-        from scanfind.kernels.blocks import fill_hash
+        from scanfind.kernels.blocks import VIEW_BITS, fill_hash
         from scanfind.kernels.surfels import count_cells, fit_surfels, number_cells
         from scanfind.threads import in_threads
 
+        self._release()
         used = int(self._counts[0])
         order = np.argsort(self._block_keys[:used])
         slots = self._block_keys[:used][order]
         slot_cells = self._block_cells[:used][order]
-        block_keys, slot_starts = np.unique(slots & ~np.int64(7), return_index=True)
+        block_keys, slot_starts = np.unique(slots >> VIEW_BITS << VIEW_BITS, return_index=True)
         slot_starts = np.append(slot_starts, used)
         hash_keys, hash_values = empty_hash(len(block_keys))
         fill_hash(block_keys, hash_keys, hash_values)

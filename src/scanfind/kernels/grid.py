@@ -1,4 +1,4 @@
-"""The streaming pass: raw points → integer moments a cell and a view octant, and the nearest range a view direction.
+"""The streaming pass: raw points → integer moments a cell and a view direction, and the nearest range a view direction.
 
 Sums are integers (offsets in 1/65536 of a cell), so they do not depend on the order of addition: chunks, threads,
 files and workers may add in any order and the result is the same to the last bit.
@@ -11,11 +11,12 @@ from math import floor, sqrt
 import numpy as np
 from numba import njit
 
-from scanfind.kernels.blocks import BIAS, find_block, insert_block, pack_block, unpack_block
+from scanfind.kernels.blocks import BIAS, VIEW_BITS, find_block, insert_block, pack_block, unpack_block
 
 MOMENTS = 13  # n, Σx Σy Σz, Σxx Σxy Σxz Σyy Σyz Σzz, Σ direction to the scanner (3)
 OFFSET_UNITS = 65536.0  # offsets within a cell are counted in 1/65536 of its edge: 0.3 µm in a cell of 2 cm
 DIRECTION_UNITS = 1048576.0
+VIEW_BINS = 3  # a view direction is one of 6 cube faces × 3 × 3: two in one bin are less than 35° apart
 
 
 @njit(cache=True, nogil=True)
@@ -42,7 +43,7 @@ def accumulate(
 
     offset : (3,) the grid's own origin, the points' frame
     hash_keys, hash_values : open addressing, power of two
-    block_keys : (B,) packed block and octant; block_cells : (B, 512) row of moments, -1 for an empty cell
+    block_keys : (B,) packed block and view; block_cells : (B, 512) row of moments, -1 for an empty cell
     counts : [blocks used, rows used, points too far away to be addressed]
     depth : (6·edge²,) nearest range seen in each direction, metres (inf where none); only if has_origin
     """
@@ -50,7 +51,7 @@ def accumulate(
     n = points.shape[0]
     last_key = np.int64(-1)
     last_block = np.int64(-1)
-    octant = 0
+    view = np.int64(0)
     dx = dy = dz = 0.0
     for i in range(start, n):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
@@ -63,8 +64,8 @@ def accumulate(
         cx, cy, cz = np.int64(fx), np.int64(fy), np.int64(fz)
         if has_origin:
             dx, dy, dz = origin[0] - px, origin[1] - py, origin[2] - pz
-            octant = (1 if dx > 0 else 0) | (2 if dy > 0 else 0) | (4 if dz > 0 else 0)
-        key = pack_block(cx >> 3, cy >> 3, cz >> 3) | octant
+            view = cube_pixel(dx, dy, dz, VIEW_BINS) if dx != 0.0 or dy != 0.0 or dz != 0.0 else 0
+        key = pack_block(cx >> 3, cy >> 3, cz >> 3) | view
         if key != last_key:
             last_block = find_block(hash_keys, hash_values, key)
             if last_block < 0:
@@ -125,7 +126,7 @@ def sum_children(
         if counts[0] + 1 > block_keys.shape[0] or counts[1] + 64 > moments.shape[0]:
             return child
         bx, by, bz = unpack_block(child_keys[child])
-        key = pack_block(bx >> 1, by >> 1, bz >> 1) | (child_keys[child] & 7)
+        key = pack_block(bx >> 1, by >> 1, bz >> 1) | (child_keys[child] & ((1 << VIEW_BITS) - 1))
         block = find_block(hash_keys, hash_values, key)
         if block < 0:
             block = counts[0]

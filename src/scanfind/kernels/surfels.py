@@ -48,9 +48,9 @@ def smallest_eigenvector(a00, a01, a02, a11, a12, a22):
 
 @njit(cache=True, nogil=True)
 def count_cells(slot_starts, slot_cells):
-    """Occupied cells of each block, whatever octant they were seen from, (B,).
+    """Occupied cells of each block, wherever they were seen from, (B,).
 
-    slot_starts : (B+1,) which slots (block × octant) belong to each block
+    slot_starts : (B+1,) which slots (block × view) belong to each block
     slot_cells : (slots, 512) row of moments, -1 for empty
     """
     counts = np.zeros(slot_starts.shape[0] - 1, np.int64)
@@ -65,10 +65,10 @@ def count_cells(slot_starts, slot_cells):
 
 @njit(cache=True, nogil=True)
 def number_cells(slot_starts, slot_cells, first_cell, moments, block_cells, cell_locals, totals):
-    """Number the cells block by block and sum their octants.
+    """Number the cells block by block and sum their views.
 
     block_cells : (B, 512) out: number of each cell, -1 for empty
-    totals : (V, 10) float32 out: n, Σx, Σxxᵀ of each cell, all octants together; 40 bytes that the 27 cells around read
+    totals : (V, 10) float32 out: n, Σx, Σxxᵀ of each cell, all views together; 40 bytes that the 27 cells around read
     """
     for block in range(slot_starts.shape[0] - 1):
         cell = first_cell[block]
@@ -172,7 +172,7 @@ def fit_surfels(
             nx, ny, nz, low, _, _ = plane_of(pool)
             cx, cy, cz = ((bx << 3) + lx + 0.5) * cell, ((by << 3) + ly + 0.5) * cell, ((bz << 3) + lz + 0.5) * cell
 
-            # A thin plate scanned from both sides: the sums of directions of its octants disagree about the side.
+            # A thin plate scanned from both sides: its views disagree about the side.
             front = back = toward = 0.0
             for slot in range(slot_starts[block], slot_starts[block + 1]):
                 row = slot_cells[slot, local]
