@@ -141,16 +141,17 @@ def test_a_file_keeps_what_was_built(filled: Path) -> None:
     assert sorted(file.name for file in filled.parent.iterdir()) == [filled.name]
 
 
-def test_a_piece_of_scan_is_a_model_too(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its surface comes from `surfels`; here, from the box the points were drawn on."""
-    import scanfind.surfels
-    from scanfind.surface import sample_mesh
-
-    surface = sample_mesh(box(1, 1, 1), SMALL.surface)
-    monkeypatch.setattr(scanfind.surfels, "sample_cloud", lambda _cloud, _parameters: surface, raising=False)
+def test_a_piece_of_scan_is_a_model_too(path: Path) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (20_000, 3))
+    points[np.arange(20_000), rng.integers(0, 3, 20_000)] = rng.choice([-0.5, 0.5], 20_000)
     with ModelLibrary.open(path, create=True) as library:
-        cloud = CloudModel("piece", surface.samples.points, "scan.e57", np.array([1.0, 2.0, 3.0]))
-        assert_same(library.add(cloud, SMALL), library.get("piece"))
+        for origin in (None, np.array([1.0, 2.0, 3.0])):
+            name = "known side" if origin is not None else "no side"
+            piece = library.add(CloudModel(name, points, "scan.e57", origin), SMALL)
+            assert_same(piece, library.get(name))
+            assert piece.signed == (origin is not None)
+            assert piece.diameter == pytest.approx(np.sqrt(3.0), rel=0.1)
         assert library.show()[0].triangles == 0
 
 

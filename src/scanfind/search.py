@@ -86,7 +86,7 @@ class SearchParameters:
     def __post_init__(self) -> None:
         require(0.0 < self.overlap_ratio <= 1.0, "overlap_ratio", self.overlap_ratio, "above 0 and at most 1")
         limit = self.time_limit_s
-        require(limit is None or limit > 0.0, "time_limit_s", limit, "more than 0 seconds")
+        require(limit is None or limit >= 0.0, "time_limit_s", limit, "0 seconds or more")
         require(0.0 <= self.miss_probability < 1.0, "miss_probability", self.miss_probability, "from 0 to below 1")
         require(
             limit is not None or self.miss_probability > 0.0, "time_limit_s", limit, "given where miss_probability is 0"
