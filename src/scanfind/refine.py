@@ -60,7 +60,12 @@ def icp(
     hypotheses: Hypotheses, surfels: Surfels, arrays: ModelArrays, signed: bool, gates: Floats, most_samples: int,
     normal_agreement: float, jobs: int,
 ) -> Refined:  # fmt: skip
-    """Point-to-plane ICP of each hypothesis, one step for each gate (metres, at most one cell of the surfels)."""
+    """Point-to-plane ICP of each of H hypotheses on the surfels.
+
+    gates : one step each, metres: how far a sample may be from its surfel
+    most_samples : of each model; normal_agreement : see RefineParameters
+    signed : both sides know which way their normals face
+    """
     from scanfind.kernels.icp import refine_poses
 
     count = len(hypotheses.models)

@@ -41,7 +41,7 @@ class Scene:
     bends : (S,) for each fine surfel, standard deviation across the plane of the `window` around it, metres
     window : edge of that cube, metres
     depths : what each known scanner position saw; empty where none is known
-    noise : spread of raw points across the flatter quarter of the surfels: the scanner's noise, metres
+    noise : spread of raw points across the median surfel: the scanner's noise, metres (see `quiet`)
     points, unaddressable : raw points in the grid, and those too far from the rest to be
     """
 
@@ -77,6 +77,7 @@ def build_scene(
 ) -> Scene:
     """Resample a filled grid (paper 3.1), doubling its cells until the scan fills them.
 
+    grid : the raw points, in cells of `first_cell`; it is left as it is
     diameter : of the smallest model sought, metres
     test_cells_across : cells of the sequential test along that diameter; a surfel tolerates a sample that is half of
         one off along its normal
@@ -106,8 +107,9 @@ def build_scene(
 
 
 def quiet(flatness: Floats) -> float:
-    """The noise in some surfels' flatness, metres: its median. Edges and bends spread the upper half, and quantised
-    ranges (a Kinect's) lie in one plane in much of the lower.
+    """The noise in some surfels' flatness, metres: its median.
+
+    Edges and bends spread the upper half, and quantised ranges (a Kinect's) lie in one plane in much of the lower.
     """
     return float(np.median(flatness)) if len(flatness) else 0.0
 

@@ -38,8 +38,8 @@ BINS_A_DISTANCE = 6
 # windows over 0.1 m, a pipe as wide as the window above the last.
 BEND_BORDERS = (0.02, 0.05, 0.1)
 # A pair that lies on an instance finds it when noise left its feature in the right cell of the hash table and one of
-# the model's pairs there is near enough: measured 0.3 – 1
-# on shop scenes, 0.1 on a pump. Only until an instance is found; then it is counted (Search.learn).
+# the model's pairs there is near enough: measured 0.3 – 1 on shop scenes, 0.1 on a pump. Only until an instance is
+# found; then it is counted (Search.learn).
 RIGHT_PAIR_FINDS = 0.2
 
 
@@ -102,8 +102,9 @@ class SearchParameters:
 class ModelArrays(NamedTuple):
     """The samples of all models sought, end to end.
 
-    starts : (models+1,) int64; points, normals : (N, 3); samples : (N, 6) float32, both side by
-        side; centres (models, 3), radii (models,) : of the samples, metres
+    starts : (models+1,) int64, where each model's begin
+    points, normals : (N, 3), model frame, metres; samples : (N, 6) float32, both side by side
+    centres, radii : (models, 3), (models,) of the samples: their mean, and their root mean square distance from it
     """
 
     starts: NDArray[np.int64]
@@ -184,7 +185,6 @@ class Search:
         # As far as two samples of a model may be off, but never less than the scene's own resampling.
         self._tolerance = max(scene.fine.cell, self.pairs.tolerance * min(model.spacing for model in models))
         self.pool = np.empty(0, np.intp)
-        self.done = np.zeros(len(models), np.bool_)
         self._fill_pool()
         way = np.random.default_rng(seed).standard_normal((DIRECTIONS, 3))
         self._directions = way / np.linalg.norm(way, axis=1)[:, None]
@@ -192,22 +192,20 @@ class Search:
         self.drawn = self.tested = self.hypotheses = self.lookups = 0
         self._expected = np.zeros(len(models))
         self._learned = np.zeros((len(models), 2))  # hits, and what was shown, of the instances found
-        self._unsigned = not (scene.fine.signed and all(m.signed for m in models))
+        self._sides = 1 if scene.fine.signed and all(m.signed for m in models) else 4
         # A right hypothesis puts λs of its samples on the scene, and chance some of the others.
         wanted = parameters.overlap_ratio
         right = wanted + (1.0 - wanted) * parameters.chance_overlap
         self._least_hits = wald_table(parameters.tests, right, parameters.chance_overlap)
 
     def withdraw(self, surfels: NDArray[np.intp]) -> None:
-        """Draw no more from surfels that are explained."""
+        """Draw no more from these surfels (indices): they are explained."""
         self._free[surfels] = False
         self._fill_pool()
 
     def _fill_pool(self) -> None:
         """Choose the surfels that may be drawn: each with a chance by the likelihood ratio of its shape."""
-        counts = np.bincount(self._classes[self._free], minlength=len(BEND_BORDERS) + 1)
-        ratio = np.where(counts > 0, self.model_shapes.mean(axis=0) / np.maximum(counts, 1), 0.0)
-        kept = ratio / max(ratio.max(), 1e-300) if self.parameters.by_shape else np.ones(len(counts))
+        counts, kept = self._likelihood(self._free)
         # Where the telling surfels are few, the others fill up: they may be all there is to draw from.
         while 0 < np.minimum(kept, 1.0) @ counts < min(LEAST_POOL, 0.9 * counts.sum()):
             kept = kept * 1.25
@@ -221,24 +219,32 @@ class Search:
         }
 
     def telling(self) -> Floats:
-        """How much each surfel tells, (S,), 0 … 1: the likelihood ratio of its shape, model against scene.
+        """How much each surfel tells, (S,), 0 … 1: the root of the likelihood ratio of its shape, model against scene.
 
         A plate flush with a floor lies on the scene with all of its samples, and that means nothing.
         """
-        counts = np.bincount(self._classes[self.scene.fine.has_normal()], minlength=len(BEND_BORDERS) + 1)
+        _, likelihood = self._likelihood(self.scene.fine.has_normal())
+        return np.asarray(np.sqrt(likelihood)[self._classes])
+
+    def _likelihood(self, among: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Floats]:
+        """Of C classes of shape, how many of some surfels are in each, and its likelihood ratio over the largest, (C,).
+
+        among : (S,) which surfels
+        """
+        counts = np.bincount(self._classes[among], minlength=len(BEND_BORDERS) + 1)
+        if not self.parameters.by_shape:
+            return counts, np.ones(len(counts))
         ratio = np.where(counts > 0, self.model_shapes.mean(axis=0) / np.maximum(counts, 1), 0.0)
-        weights = np.sqrt(ratio / max(ratio.max(), 1e-300)) if self.parameters.by_shape else np.ones(len(counts))
-        return np.asarray(weights[self._classes])
+        return counts, ratio / max(ratio.max(), 1e-300)
 
     def may_stop(self) -> bool:
-        """Has an instance of any model still sought been missed with less than the chance allowed?"""
+        """Is nothing left to draw from, or the chance to have missed an instance of any model below the one allowed?"""
         return len(self.pool) < 2 or self.chance_missed() < self.parameters.miss_probability
 
     def chance_missed(self) -> float:
         """Chance to have missed an instance that shows λs of its surface, for the model worst served so far."""
         expected = np.where(self._learned[:, 1] > 0.0, self.rounds * self._rate(), self._expected)
-        left = expected[~self.done]
-        return exp(-float(left.min())) if len(left) else 0.0
+        return exp(-float(expected.min()))
 
     def learn(self, model: int, hits: int, support: float) -> None:
         """Learn from an instance how often a round hits one: pairs on it go with the square of what it shows."""
@@ -263,7 +269,7 @@ class Search:
             test_pairs(
                 start, stop, first, second, signs, keys, fine.means, fine.normals,
                 table.offsets, table.model, table.first, table.second, arrays.starts, arrays.points, arrays.normals,
-                arrays.samples, self.done, self.parameters.normal_length_m, tolerant.cell, tolerant.hash_keys,
+                arrays.samples, self.parameters.normal_length_m, tolerant.cell, tolerant.hash_keys,
                 tolerant.hash_values, tolerant.occupied, tolerant.masks, self._least_hits, self._origins,
                 support, models, rotations, translations, work,
             )  # fmt: skip
@@ -287,7 +293,9 @@ class Search:
         order = np.flatnonzero(known)
         if self.parameters.telling_first:
             order = order[np.argsort(common[keys[order]], kind="stable")]
-        affordable = np.searchsorted(np.cumsum(cost[order]), self.parameters.hypotheses_a_round) + 1
+        # Three of four choices of sides are wrong: as many more hypotheses are tested for the same right pairs.
+        most = self.parameters.hypotheses_a_round * self._sides
+        affordable = np.searchsorted(np.cumsum(cost[order]), most) + 1
         order = order[:affordable]
         self._expect(keys, keys[order])
         return first[order], second[order], signs[order], keys[order]
@@ -311,7 +319,7 @@ class Search:
         met = second >= 0
         first, second = first[met], second[met]
         # Where nobody knows a normal's side, each pair is looked up with all four choices of sides.
-        sides = 4 if self._unsigned else 1
+        sides = self._sides
         signs = np.repeat(np.arange(sides), len(first))
         first, second = np.tile(first, sides), np.tile(second, sides)
         keys = np.empty(len(first), np.int64)
@@ -385,7 +393,7 @@ def bin_pool(pool: NDArray[np.intp], means: Floats, edge: float) -> Bins:
 
 
 def shape_classes(bends: Floats, window: float) -> NDArray[np.int8]:
-    """Class of each point by how bent the surface in the window around it is, (S,)."""
+    """Class of each point by how bent the surface around it is, (S,); bends : (S,), window : both metres."""
     return np.digitize(bends, np.array(BEND_BORDERS) * window).astype(np.int8)
 
 

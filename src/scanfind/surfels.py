@@ -7,16 +7,13 @@ their pooled covariance its normals by PCA (3.2); moments add, so levels, chunks
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.cloud import PointChunk
 from scanfind.errors import require
-
-if TYPE_CHECKING:
-    pass
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -233,7 +230,10 @@ class MomentGrid:
         return maps
 
     def surfels(self, min_neighbours: int = 5, jobs: int = 1) -> Surfels:
-        """The mean and the oriented normal of each cell (paper 3.2: PCA over a neighbourhood)."""
+        """The mean and the oriented normal of each cell (paper 3.2: PCA over a neighbourhood).
+
+        min_neighbours : see GridParameters; jobs : threads, on which the result does not depend
+        """
         from scanfind.kernels.blocks import VIEW_BITS, fill_hash
         from scanfind.kernels.surfels import count_cells, fit_surfels, number_cells
         from scanfind.threads import in_threads

@@ -217,7 +217,7 @@ def fetch(points, normals, i, sign, point, normal):
 @njit(cache=True, nogil=True)
 def test_pairs(
     start, stop, pair_first, pair_second, pair_signs, pair_keys, means, normals,
-    offsets, entry_model, entry_first, entry_second, model_starts, model_points, model_normals, samples, skip_model,
+    offsets, entry_model, entry_first, entry_second, model_starts, model_points, model_normals, samples,
     length, cell, hash_keys, hash_values, occupied, masks, least_hits, origins,
     best_support, best_model, best_rotation, best_translation, work,
 ):  # fmt: skip
@@ -226,7 +226,6 @@ def test_pairs(
     offsets, entry_* : the library's hash table in CSR form; entry_first, entry_second : samples of entry_model
     model_starts : (models+1,) where each model's samples begin in model_points, model_normals
     samples : (N, 6) float32, the same points and normals side by side, for the test
-    skip_model : (models,) True for models no longer sought
     length : metres, of the normals in the four-point sets; 0 for the limit (see pair_pose)
     least_hits : (T+1,) Wald's test as a table: after k points fewer hits than least_hits[k] end it
     origins : (K, 3) scanner positions: samples that face none of them are passed over; none: all are tested
@@ -246,8 +245,6 @@ def test_pairs(
         frame_of_pair(s1, b1, s2, b2, scene)
         for entry in range(offsets[pair_keys[k]], offsets[pair_keys[k] + 1]):
             which = entry_model[entry]
-            if skip_model[which]:
-                continue
             base, n = model_starts[which], model_starts[which + 1] - model_starts[which]
             fetch(model_points, model_normals, base + entry_first[entry], 1.0, m1, a1)
             fetch(model_points, model_normals, base + entry_second[entry], 1.0, m2, a2)
