@@ -1,6 +1,7 @@
 # make demo   install, find a pump skid in a real scan of a plant room, say where the results lie
 # make test   install, lint, check types and imports, run all tests
 # make fast   the tests that take seconds, in an environment that `make test` made
+# make clean-kernels   after a change in a kernel that other kernels call: their caches do not notice it
 
 PYTHON ?= python3.11
 VENV ?= .venv
@@ -11,7 +12,7 @@ SOURCES := $(shell find src -name '*.py')
 KERNEL_TESTS := $(wildcard $(foreach stage,near_surface isolate surface pairs surfels search verify refine scene,\
 	tests/test_$(stage)*.py))
 
-.PHONY: demo test fast lint clean
+.PHONY: demo test fast lint clean clean-kernels
 
 demo: $(VENV)/installed
 	$(BIN)/scanfind find examples/pump/scan.e57 --model examples/pump/skid.ply --out $(DEMO) --overwrite
@@ -42,5 +43,8 @@ $(VENV)/developed: pyproject.toml | $(BIN)/python
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
-clean:
+clean-kernels:
+	rm -f src/scanfind/kernels/__pycache__/*.nb? $(VENV)/numba-checked/*/*.nb?
+
+clean: clean-kernels
 	rm -rf $(VENV) $(DEMO) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -4,7 +4,7 @@ import struct
 from pathlib import Path
 from typing import Any
 
-import lzf  # type: ignore[import-not-found]
+import lzf
 import numpy as np
 import pypcd4
 import pytest

@@ -93,7 +93,7 @@ def _compressed_blocks(file: BinaryIO, header: PcdHeader, chunk_points: int, nam
 
 def _decompressed(file: BinaryIO, header: PcdHeader, name: str) -> dict[str, NDArray[Any]]:
     """The columns of a compressed file, by number; no size is believed before it is compared with the file's."""
-    import lzf  # type: ignore[import-not-found]
+    import lzf
 
     packed, size = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     left = os.fstat(file.fileno()).st_size - file.tell()
