@@ -15,11 +15,12 @@ import scanfind.sources
 from scanfind.cloud import PointCloud
 from scanfind.detection import Findings
 from scanfind.errors import InvalidGeometryError, ScanfindError, UnreadableFileError, UsageError
-from scanfind.find import PRESETS, Parameters, find
+from scanfind.find import find
 from scanfind.library import ModelLibrary
 from scanfind.mesh import Mesh
 from scanfind.model import ModelParameters
 from scanfind.pairs import PairParameters
+from scanfind.parameters import PRESETS, Parameters
 from scanfind.pose import Pose, random_rotation
 from scanfind.simulate.furniture import hall
 from scanfind.simulate.objects import pipe_spool

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from scanfind.cloud import PointChunk
-from scanfind.find import PRESETS
 from scanfind.library import joint_table
 from scanfind.model import Model, ModelParameters, build_model
+from scanfind.parameters import PRESETS
 from scanfind.pose import Pose
 from scanfind.recognise import Candidate, Recognition
 from scanfind.refine import Refined

@@ -19,11 +19,12 @@ if TYPE_CHECKING:
     from scanfind.cloud import CloudModel, PointCloud
     from scanfind.detection import Detection, Findings
     from scanfind.errors import ScanfindError
-    from scanfind.find import PRESETS, Parameters, find
+    from scanfind.find import find
     from scanfind.isolate import isolate
     from scanfind.library import ModelLibrary
     from scanfind.mesh import Mesh
     from scanfind.models import read_models
+    from scanfind.parameters import PRESETS, Parameters
     from scanfind.pose import Pose
     from scanfind.results import read_results, write_results
     from scanfind.scans import read_scan, scan_info
@@ -57,8 +58,8 @@ _HOME = {
     "Detection": "detection",
     "Findings": "detection",
     "ScanfindError": "errors",
-    "PRESETS": "find",
-    "Parameters": "find",
+    "PRESETS": "parameters",
+    "Parameters": "parameters",
     "find": "find",
     "isolate": "isolate",
     "ModelLibrary": "library",

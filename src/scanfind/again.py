@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scanfind import schema
+from scanfind.clock import Clock, watched
 from scanfind.detection import Findings
 from scanfind.document import findings_of
 from scanfind.errors import UsageError
-from scanfind.find import Clock, watched, with_points
+from scanfind.find import with_points
 from scanfind.library import ModelLibrary
 from scanfind.results import MODELS, fill_folder, open_remainder, read_results, result_folder
 from scanfind.sources import Sources

@@ -14,13 +14,12 @@ import numpy as np
 from pydantic_core import to_jsonable_python
 
 from scanfind import schema
+from scanfind.clock import STAGES
 from scanfind.detection import Detection, Deviation, Findings, Motion, Refused, SceneScan
 from scanfind.pose import Pose
 
 if TYPE_CHECKING:
     from scanfind.library import ModelLibrary
-
-STAGES = ("read", "grid", "search", "verify", "refine", "isolate", "write")
 
 # Both ends of a file and its length: a GB is told apart from another in milliseconds, not in seconds.
 FINGERPRINT_BLOCK = 1 << 20

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -13,6 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scanfind.clock import Clock, watched
 from scanfind.cloud import CloudModel, PointChunk, shift_for
 from scanfind.detection import Findings
 from scanfind.deviation import deviation_of
@@ -24,74 +22,19 @@ from scanfind.library import ModelLibrary, joint_table
 from scanfind.mesh import Mesh
 from scanfind.model import Model, ModelParameters
 from scanfind.near_surface import near_model
-from scanfind.pairs import PairParameters
+from scanfind.parameters import PRESETS, IsolationParameters, Parameters
 from scanfind.recognise import Recognition
-from scanfind.refine import RefineParameters
 from scanfind.scene import build_scene, first_cell
-from scanfind.search import SearchParameters
 from scanfind.sources import Scan, Sources, require_points
-from scanfind.surface import SurfaceParameters
-from scanfind.surfels import GridParameters, MomentGrid
+from scanfind.surfels import MomentGrid
 from scanfind.threads import available_cores
-from scanfind.verify import VerifyParameters
 
 if TYPE_CHECKING:
     from scanfind.detection import Detection
+    from scanfind.progress import Progress
     from scanfind.scans import CloudWriter
 
-STAGES = ("read", "library", "grid", "search", "verify", "refine", "isolate", "write", "total")
-
 ModelInput: TypeAlias = "ModelLibrary | Mesh | CloudModel | str | PathLike[str]"
-Progress: TypeAlias = Callable[[str, float, float], None]
-
-
-@dataclass(frozen=True)
-class IsolationParameters:
-    """Which raw points belong to a detection.
-
-    tolerance_m : those within this distance of the placed model's surface; None: `noises` times the scan's own noise
-        around the detection, at least a tenth and at most half of the grid's cell
-    """
-
-    tolerance_m: float | None = None
-    noises: float = 4.0
-
-    def __post_init__(self) -> None:
-        require(
-            self.tolerance_m is None or self.tolerance_m > 0.0, "tolerance_m", self.tolerance_m, "a positive length"
-        )
-        require(self.noises > 0.0, "noises", self.noises, "more than 0")
-
-
-@dataclass(frozen=True)
-class Parameters:
-    """Every parameter of the method, by stage."""
-
-    surface: SurfaceParameters = field(default_factory=SurfaceParameters)
-    pairs: PairParameters = field(default_factory=PairParameters)
-    grid: GridParameters = field(default_factory=GridParameters)
-    search: SearchParameters = field(default_factory=SearchParameters)
-    refine: RefineParameters = field(default_factory=RefineParameters)
-    verify: VerifyParameters = field(default_factory=VerifyParameters)
-    isolate: IsolationParameters = field(default_factory=IsolationParameters)
-
-
-PRESETS = {
-    "default": Parameters(),
-    # Table 2 of the paper and what its text says: one pair distance, uniform draws, normals of unit length, all of the
-    # time, five steps of ICP, the best single hypothesis by support alone.
-    "sharif2017": Parameters(
-        pairs=PairParameters(distances=(0.75,), rungs_per_octave=64, angle_cell_deg=12.0),
-        search=SearchParameters(
-            overlap_ratio=0.15, time_limit_s=20.0, miss_probability=0.0, max_instances=1, by_shape=False,
-            telling_first=False, normal_length_m=1.0,
-        ),
-        refine=RefineParameters(coarse_iterations=3, fine_iterations=2),
-        verify=VerifyParameters(
-            min_score=0.0, min_support=0.15, min_support_blind=0.15, penalty_weight=0.0, alternatives=0
-        ),
-    ),
-}  # fmt: skip
 
 
 def find(
@@ -112,6 +55,9 @@ def find(
 
         scans : files, (N, 3) float64 arrays in metres, or PointClouds; several are one scene
         models : a ModelLibrary or its path, meshes, pieces of scan, or files of them
+        parameters : by stage; None: the default preset
+        seed : of everything that is drawn; the same seed finds the same on any number of threads
+        jobs : threads; None: one a core
         origin : (3,) where the scanner stood, for scans that do not say; with none, free space says nothing
         units : of model files whose format has none; select : which models of an IFC file
         progress : called with (stage, done, total), total -1 where nobody knows
@@ -152,9 +98,7 @@ def find(
         with clock("refine"):
             poses = found.refine(hypotheses)  # 3.4 post-ICP
         with clock("verify"):
-            found.believe(
-                hypotheses, poses
-            )  # support and penalty (Papazov & Burschka 2010), conflicts, self-similar poses
+            found.believe(hypotheses, poses)  # support, penalty, conflicts (Papazov & Burschka 2010)
     tell("search", 1.0, 1.0)
 
     findings.extend(found.detections())
@@ -244,52 +188,3 @@ def write_rest(writer: CloudWriter, chunk: PointChunk) -> None:
     count = len(chunk)
     scan_id = np.full(count, chunk.scan, np.int32)
     writer.write(chunk.xyz, {**chunk.attributes, "scan_id": scan_id, "source_index": chunk.source_index})
-
-
-class Clock:
-    """Seconds by stage; a stage begun inside another stops the outer one's clock."""
-
-    def __init__(self) -> None:
-        self._began = self._since = time.perf_counter()
-        self._seconds = dict.fromkeys(STAGES, 0.0)
-        self._stack = ["total"]
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        """Charge the block's time to a stage."""
-        self._charge()
-        self._stack.append(stage)
-        try:
-            yield
-        finally:
-            self._charge()
-            self._stack.pop()
-
-    def _charge(self) -> None:
-        now = time.perf_counter()
-        self._seconds[self._stack[-1]] += now - self._since
-        self._since = now
-
-    def elapsed(self, *stages: str) -> float:
-        """Seconds charged to some stages so far."""
-        return sum(self._seconds[stage] for stage in stages)
-
-    def timings(self) -> dict[str, float]:
-        """Seconds by stage and in total."""
-        self._charge()
-        return {**self._seconds, "total": time.perf_counter() - self._began}
-
-
-def watched(
-    chunks: Iterator[PointChunk], clock: Clock, tell: Progress, stage: str, expected: int
-) -> Iterator[PointChunk]:
-    """The chunks; their reading charged to "read", their points told as progress of a stage."""
-    done = 0
-    while True:
-        with clock("read"):
-            chunk = next(chunks, None)
-        if chunk is None:
-            return
-        yield chunk
-        done += len(chunk) + chunk.dropped
-        tell(stage, done, expected)

@@ -17,9 +17,9 @@ from scanfind.symmetry import self_similar
 from scanfind.verify import Evidence, distances, distinct, gather, outlines, score, why_refused
 
 if TYPE_CHECKING:
-    from scanfind.find import Parameters
     from scanfind.library import JointTable
     from scanfind.model import Model
+    from scanfind.parameters import Parameters
     from scanfind.scene import Scene
 
 Floats = NDArray[np.float64]

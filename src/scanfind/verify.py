@@ -50,7 +50,7 @@ class VerifyParameters:
     margin_inliers: float = 2.0
     margin_cells: float = 1.0
     least_facing: float = 0.25
-    penalty_weight: float = 1.0
+    penalty_weight: float = 2.0
     shared: float = 0.2
     alternatives: int = 24
 

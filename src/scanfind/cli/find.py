@@ -103,8 +103,8 @@ def find(
     from scanfind.cli.inputs import open_models
     from scanfind.config import load_settings
     from scanfind.document import document, model_entries
-    from scanfind.find import PRESETS
     from scanfind.find import find as find_models
+    from scanfind.parameters import PRESETS
     from scanfind.progress import progress_on
     from scanfind.results import fill_folder, open_remainder, result_folder
 

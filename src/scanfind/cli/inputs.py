@@ -11,8 +11,8 @@ from scanfind.cli.options import note
 
 if TYPE_CHECKING:
     from scanfind.config import Run
-    from scanfind.find import Parameters
     from scanfind.library import ModelLibrary
+    from scanfind.parameters import Parameters
 
 
 @contextmanager

@@ -55,8 +55,8 @@ def add(
     """
     from scanfind.cli.inputs import add_models
     from scanfind.config import load_settings
-    from scanfind.find import PRESETS
     from scanfind.library import ModelLibrary
+    from scanfind.parameters import PRESETS
 
     flags = {"preset": preset, "units": units, "select": select}
     run, parameters = load_settings(PRESETS, flags, config)
