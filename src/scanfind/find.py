@@ -56,7 +56,7 @@ def find(
         scans : files, (N, 3) float64 arrays in metres, or PointClouds; several are one scene
         models : a ModelLibrary or its path, meshes, pieces of scan, or files of them
         parameters : by stage; None: the default preset
-        seed : of everything that is drawn; the same seed finds the same on any number of threads
+        seed : of everything that is drawn; the same seed finds the same on any number of threads, unless time runs out
         jobs : threads; None: one a core
         origin : (3,) where the scanner stood, for scans that do not say; with none, free space says nothing
         units : of model files whose format has none; select : which models of an IFC file
