@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from scanfind.model import Model
     from scanfind.parameters import Parameters
     from scanfind.scene import Scene
+    from scanfind.surfels import Surfels
 
 Floats = NDArray[np.float64]
 
@@ -32,7 +33,9 @@ REFUSED_SHOWN = 3  # of each model: what came closest
 class Candidate(NamedTuple):
     """A refined pose with what the scene says of it.
 
-    rotation (3, 3), translation (3,) : scene_from_model, relative to the grid's offset; hessian (6, 6) : of ICP
+    model : its number among those sought
+    rotation, translation : (3, 3), (3,) scene_from_model, relative to the grid's offset
+    hessian : (6, 6) of ICP, see Refined
     score : 0 … 1; area : supported surface, counted by how much it tells, less what was seen through, m²: by it
         conflicting poses are ranked
     """
@@ -103,7 +106,7 @@ class Recognition:
         return self._icp_fine(better.take(distinct(better, self.arrays, self._apart_after, kept, 2 * kept)))
 
     def _far_from(self, hypotheses: Hypotheses, met: Hypotheses) -> NDArray[np.intp]:
-        """The hypotheses that would not be drawn to where others went already (indices)."""
+        """The hypotheses that would not be drawn to where those in `met` went already (indices)."""
         theirs, placed = outlines(met, self.arrays), outlines(hypotheses, self.arrays)
         far = [
             not (distances(placed[k], theirs[met.models == model]) < self._drawn_in[model]).any()
@@ -114,23 +117,16 @@ class Recognition:
     def _icp_coarse(self, hypotheses: Hypotheses) -> Refined:
         refine, coarse = self.parameters.refine, self.scene.coarse
         gates = shrinking(refine.coarse_gates, refine.coarse_iterations, coarse.cell)
-        return icp(
-            hypotheses,
-            coarse,
-            self.arrays,
-            self.signed,
-            gates,
-            refine.coarse_samples,
-            refine.normal_agreement,
-            self.jobs,
-        )
+        return self._icp(hypotheses, coarse, gates, refine.coarse_samples)
 
     def _icp_fine(self, hypotheses: Hypotheses) -> Refined:
         refine, fine = self.parameters.refine, self.scene.fine
         gates = shrinking(refine.fine_gates, refine.fine_iterations, fine.cell)
-        return icp(
-            hypotheses, fine, self.arrays, self.signed, gates, refine.fine_samples, refine.normal_agreement, self.jobs
-        )
+        return self._icp(hypotheses, fine, gates, refine.fine_samples)
+
+    def _icp(self, hypotheses: Hypotheses, surfels: Surfels, gates: Floats, most_samples: int) -> Refined:
+        agreement = self.parameters.refine.normal_agreement
+        return icp(hypotheses, surfels, self.arrays, self.signed, gates, most_samples, agreement, self.jobs)
 
     def candidates(self, refined: Refined) -> list[Candidate]:
         """Refined poses with their evidence."""
@@ -155,6 +151,7 @@ class Recognition:
         Papazov & Burschka's conflict graph, solved greedily by the surface a pose explains.
 
         hypotheses : of the round, to learn how often an instance is hit
+        refined : what became of the best of them, see `refine`
         """
         verify, settled = self.parameters.verify, {id(candidate) for candidate in self.believed}
         fresh = []
