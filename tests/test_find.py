@@ -460,3 +460,16 @@ def test_sparse_scans_of_a_shop_have_no_ghosts(spools: tuple[Mesh, ModelLibrary]
     found = find(measured.stations, kept)
     assert_right(found[0].scene_from_model, measured.truth[mesh.name][0])
     assert len(found) == 1
+
+
+def test_a_part_on_a_floor_is_never_found_sunk_into_it() -> None:
+    """Flush with the floor, half of the part lies on the scan and the other half is hidden: no evidence for it at all."""
+    part = blocks("angle", [((-0.5, -0.3, 0), (0.5, 0.3, 0.1)), ((-0.5, -0.3, 0.1), (-0.4, 0.3, 0.75))])
+    place = Pose.from_rotation_vector([0.0, 0.0, 0.6], [1.5, -0.8, 0.0])
+    floor = SceneObject("floor", box(8.0, 8.0, 0.2), Pose(np.eye(3), np.array([-4.0, -4.0, -0.2])))
+    for station in ([-0.5, -2.5, 2.0], [3.5, 1.0, 2.0]):
+        seen = scan(Scene((floor, SceneObject("angle", part, place, target=True)), np.array([station])), points=100_000)
+        for found in find(seen.stations, part, parameters=QUICK):
+            metres, radians = found.scene_from_model.difference(place)
+            assert metres < 0.02, found
+            assert radians < np.radians(1.0), found
