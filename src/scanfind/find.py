@@ -17,7 +17,7 @@ from scanfind.deviation import deviation_of
 from scanfind.errors import UsageError, require
 from scanfind.isolate import IsolateParameters, Placed
 from scanfind.isolate import isolate as isolate_raw
-from scanfind.kernels import COMPILE_S, compiled
+from scanfind.kernels import COMPILE_S, compiled, use_threads
 from scanfind.library import ModelLibrary, joint_table
 from scanfind.mesh import Mesh
 from scanfind.model import Model, ModelParameters
@@ -104,6 +104,7 @@ def find(
     findings.extend(found.detections())
     findings.refused = found.refused()
     if isolate and (findings or remainder is not None):
+        use_threads(jobs)
         with clock("isolate"):  # 3.5 isolation: the second pass
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
             tolerance = isolation_tolerance(parameters.isolate, found.noise(), scene.fine.cell)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,8 +12,6 @@ from scanfind.errors import ScanfindError
 
 if TYPE_CHECKING:
     from scanfind.cloud import ScanInfo
-
-HEADER_BYTES = 1 << 16
 
 
 def info(files: Annotated[list[Path], Parameter(name="FILE", negative=())], /, *, json: Flag = False) -> int:
@@ -53,20 +50,14 @@ def _told(file: Path) -> dict[str, Any]:
     from dataclasses import asdict
 
     from scanfind.models import model_info
+    from scanfind.models.ply import has_faces
     from scanfind.scans import SCAN_READERS, scan_info
 
-    if file.suffix.lower() in SCAN_READERS and not _has_faces(file):
+    suffix = file.suffix.lower()
+    is_mesh = suffix == ".ply" and file.is_file() and has_faces(file)
+    if suffix in SCAN_READERS and not is_mesh:
         return _scan_facts(scan_info(file))
     return asdict(model_info(file))
-
-
-def _has_faces(file: Path) -> bool:
-    """Whether the header of a PLY announces faces: then it is a model, else a scan."""
-    if file.suffix.lower() != ".ply" or not file.is_file():
-        return False
-    with file.open("rb") as ply:
-        header = ply.read(HEADER_BYTES).partition(b"end_header")[0]
-    return re.search(rb"^element\s+face\s+0*[1-9]", header, re.MULTILINE) is not None
 
 
 def _scan_facts(about: ScanInfo) -> dict[str, Any]:

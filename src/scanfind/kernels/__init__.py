@@ -7,6 +7,13 @@ from pathlib import Path
 COMPILE_S = 20.0  # roughly, on two cores, for the kernels of one search
 
 
+def use_threads(jobs: int) -> None:
+    """Let the parallel kernels, those of isolation, use so many threads, and no more than the machine offers."""
+    import numba
+
+    numba.set_num_threads(max(1, min(jobs, numba.config.NUMBA_NUM_THREADS)))
+
+
 def compiled() -> bool:
     """Have the kernels been compiled on this machine before, so that they only need loading?"""
     from scanfind.kernels.search import test_pairs

@@ -32,6 +32,11 @@ class Property(NamedTuple):
     dtype: np.dtype[Any]
     length: np.dtype[Any] | None = None
 
+    @property
+    def is_list(self) -> bool:
+        """Whether it is a list."""
+        return self.length is not None
+
 
 @dataclass(frozen=True)
 class Element:
@@ -44,15 +49,28 @@ class Element:
     @property
     def is_fixed(self) -> bool:
         """Whether all its records have one size: it has no lists."""
-        return all(p.length is None for p in self.properties)
+        return not any(p.is_list for p in self.properties)
 
     def record(self) -> np.dtype[Any]:
         """One record without lists; the fields are numbered, because names may repeat."""
         return np.dtype([(str(k), p.dtype) for k, p in enumerate(self.properties)])
 
 
+class Declared(NamedTuple):
+    """What the header says, believed or not.
+
+    encoding : a key of ORDERS
+    elements : in the order of the data
+    lines : how many lines the header has
+    """
+
+    encoding: str
+    elements: list[Element]
+    lines: int
+
+
 class PlyHeader(NamedTuple):
-    """What the header says, proven possible.
+    """What the header says of the points, proven possible.
 
     encoding : a key of ORDERS
     before : the elements in front of the vertices
@@ -69,8 +87,8 @@ class PlyHeader(NamedTuple):
     lines: int
 
 
-def read_header(file: BinaryIO, name: str) -> PlyHeader:
-    """Read and check the header, and leave `file` at the data; raises UnreadableFileError, UnsupportedFormatError."""
+def read_declared(file: BinaryIO, name: str) -> Declared:
+    """Read the header, and leave `file` at the data; raises UnreadableFileError."""
     if file.readline(8).strip() != b"ply":
         msg = f"{name} is not a PLY file: its first line is not 'ply'"
         raise UnreadableFileError(msg)
@@ -100,6 +118,12 @@ def read_header(file: BinaryIO, name: str) -> PlyHeader:
             case _:
                 msg = f"{name} is damaged: header line {lines} is {' '.join(words)[:80]!r}"
                 raise UnreadableFileError(msg)
+    return Declared(encoding, elements, lines)
+
+
+def read_header(file: BinaryIO, name: str) -> PlyHeader:
+    """Read and check the header, and leave `file` at the data; raises UnreadableFileError, UnsupportedFormatError."""
+    encoding, elements, lines = read_declared(file, name)
     vertex, before = _vertices(elements, name)
     names = [p.name for p in vertex.properties]
     xyz = axes(names)
@@ -125,7 +149,7 @@ def _vertices(elements: list[Element], name: str) -> tuple[Element, tuple[Elemen
         msg = f"{name} has no points: no 'element vertex' in its header"
         raise UnreadableFileError(msg)
     k = names.index("vertex")
-    if lists := [p.name for p in elements[k].properties if p.length is not None]:
+    if lists := [p.name for p in elements[k].properties if p.is_list]:
         msg = f"{name}: each point has a list ({lists[0]}), which is not read; save it without"
         raise UnsupportedFormatError(msg)
     return elements[k], tuple(elements[:k])
