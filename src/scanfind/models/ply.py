@@ -21,6 +21,8 @@ from scanfind.models.polygons import fans
 from scanfind.models.wanted import Wanted
 from scanfind.scans.ply_header import Element, Property, read_declared
 
+Ints = NDArray[np.int64]
+
 CORNERS = ("vertex_indices", "vertex_index")
 
 
@@ -63,9 +65,7 @@ def _check_room(elements: list[Element], size: int) -> None:
             raise ValueError(msg)
 
 
-def _read_ascii(
-    data: bytes, elements: list[Element]
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+def _read_ascii(data: bytes, elements: list[Element]) -> tuple[NDArray[np.float64], Ints, Ints]:
     """Vertices (V, 3), corners (C,) and corners of each face (P,); one element a line."""
     lines = [line for line in data.splitlines() if line.strip()]
     vertices, corners, counts = np.zeros((0, 3)), [], []  # type: tuple[NDArray[np.float64], list[int], list[int]]
@@ -107,9 +107,7 @@ def _face_of(words: list[bytes], properties: list[Property]) -> list[int]:
     raise ValueError(msg)
 
 
-def _read_binary(
-    data: bytes, elements: list[Element]
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+def _read_binary(data: bytes, elements: list[Element]) -> tuple[NDArray[np.float64], Ints, Ints]:
     """As `_read_ascii`."""
     vertices = np.zeros((0, 3))
     corners = counts = np.zeros(0, np.int64)
@@ -128,7 +126,7 @@ def _read_binary(
     return vertices, corners, counts
 
 
-def _read_lists(data: bytes, at: int, element: Element) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+def _read_lists(data: bytes, at: int, element: Element) -> tuple[Ints, Ints, int]:
     """The corner lists of an element's rows, end to end; the length of each; where the next element begins."""
     if not element.count:
         return np.zeros(0, np.int64), np.zeros(0, np.int64), at
@@ -155,9 +153,9 @@ def _read_lists(data: bytes, at: int, element: Element) -> tuple[NDArray[np.int6
     return np.concatenate(faces), np.array([len(face) for face in faces]), at
 
 
-def _row(data: bytes, at: int, element: Element) -> tuple[NDArray[np.int64], int, list[int]]:
+def _row(data: bytes, at: int, element: Element) -> tuple[Ints, int, list[int]]:
     """One row that has lists: its corners, where the next row begins, how many values each property has."""
-    corners, lengths = np.zeros(0, np.int64), []  # type: tuple[NDArray[np.int64], list[int]]
+    corners, lengths = np.zeros(0, np.int64), []  # type: tuple[Ints, list[int]]
     for prop in element.properties:
         length = 1
         if prop.length is not None:
