@@ -20,7 +20,9 @@ from scanfind.models.wanted import Wanted
 def read(path: Path, wanted: Wanted) -> list[Mesh]:
     """One mesh of the whole file; its parts are the file's objects (`o`). Raises UnreadableFileError."""
     vertices: list[tuple[float, float, float]] = []
-    names, corners, counts = [path.stem], [[]], [[]]  # type: tuple[list[str], list[list[int]], list[list[int]]]
+    names = [path.stem]
+    corners: list[list[int]] = [[]]
+    counts: list[list[int]] = [[]]
     text = path.read_bytes().decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
     line = ""
     try:

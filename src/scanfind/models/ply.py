@@ -68,7 +68,9 @@ def _check_room(elements: list[Element], size: int) -> None:
 def _read_ascii(data: bytes, elements: list[Element]) -> tuple[NDArray[np.float64], Ints, Ints]:
     """Vertices (V, 3), corners (C,) and corners of each face (P,); one element a line."""
     lines = [line for line in data.splitlines() if line.strip()]
-    vertices, corners, counts = np.zeros((0, 3)), [], []  # type: tuple[NDArray[np.float64], list[int], list[int]]
+    vertices = np.zeros((0, 3))
+    corners: list[int] = []
+    counts: list[int] = []
     row = 0
     for element in elements:
         rows = lines[row : row + element.count]
@@ -155,7 +157,8 @@ def _read_lists(data: bytes, at: int, element: Element) -> tuple[Ints, Ints, int
 
 def _row(data: bytes, at: int, element: Element) -> tuple[Ints, int, list[int]]:
     """One row that has lists: its corners, where the next row begins, how many values each property has."""
-    corners, lengths = np.zeros(0, np.int64), []  # type: tuple[Ints, list[int]]
+    corners = np.zeros(0, np.int64)
+    lengths: list[int] = []
     for prop in element.properties:
         length = 1
         if prop.length is not None:
