@@ -121,6 +121,8 @@ class MomentGrid:
     """
 
     def __init__(self, cell: float, offset: Floats | None = None) -> None:
+        from scanfind.kernels.grid import MOMENTS
+
         self.cell = cell
         self.offset = offset
         self.points = 0
@@ -131,7 +133,7 @@ class MomentGrid:
         self._hash_values = np.zeros(4 * EMPTY_BLOCKS, np.int32)
         self._block_keys = np.empty(EMPTY_BLOCKS, np.int64)
         self._block_cells = np.empty((EMPTY_BLOCKS, 512), np.int32)
-        self._moments = np.empty((EMPTY_ROWS, 13), np.int64)
+        self._moments = np.empty((EMPTY_ROWS, MOMENTS), np.int64)
         self._counts = np.zeros(3, np.int64)
         self._held: list[PointChunk] = []
         self._depths: dict[tuple[float, ...], NDArray[np.float32]] = {}
