@@ -167,6 +167,10 @@ def test_points_are_cut_again_without_searching(shop: Path, tmp_path: Path, caps
     assert 0 < less.detections[0].points < first.detections[0].points
     assert less.detections[0].points + _points(other / "remainder.ply") == _points(shop / "scan.ply")
     assert _files(found) == points
+    assert main(["isolate", str(found), scan_file, "--out", str(other)]) == 1
+    assert "pass --overwrite" in capsys.readouterr().err
+    assert main(["isolate", str(found), scan_file, "--out", str(other), "--overwrite"]) == 0
+    assert read_results(other).detections[0].points == first.detections[0].points
     capsys.readouterr()
 
 
@@ -177,7 +181,7 @@ def test_a_library_is_listed_shown_and_shrunk(shop: Path, tmp_path: Path, capsys
     library = str(tmp_path / "parts.scanfind")
     assert main(["library", "add", library, str(shop / "spool.stl"), str(shop / "ball.stl"), "--units", "mm"]) == 0
     assert main(["library", "add", library, str(shop / "ball.stl"), "--units", "mm"]) == 0
-    assert "1 models read, 0 new, 2 in all" in capsys.readouterr().err
+    assert "models read: 1, new: 0, in all: 2" in capsys.readouterr().err
     assert main(["library", "list", library]) == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["model", "ball", "spool"]
     assert main(["library", "show", library, "ball", "--json"]) == 0
@@ -215,11 +219,11 @@ def test_info_tells_scans_from_models(shop: Path, capsys: pytest.CaptureFixture[
         (["fnd"], 2, 'Did you mean "find"?'),
         (["find", "a.e57", "--modle", "b"], 2, "Did you mean --model?"),
         (["find", "a.e57"], 2, "--model FILE... after the scans"),
-        (["find", "--model", "a.stl", "b.e57"], 2, "SCAN"),
+        (["find", "--model", "a.stl", "b.e57"], 2, "scans come before --model"),
         (["find", "a.e57", "--model", "a.stl", "--library", "lib"], 2, "exclude each other"),
         (["find", "a.e57", "--model", "a.stl", "--seed", "x"], 2, "--seed"),
         (["find", "a.e57", "--model", "a.stl", "--remainder"], 2, "--out DIR"),
-        (["find", "a.e57", "--model", "a.stl", "--origin", "1,2"], 2, "origin"),
+        (["find", "a.e57", "--model", "a.stl", "--origin", "1,2"], 2, "takes 3 values with commas between, got 2"),
         (["find", "a.e57", "--model", "a.stl", "--seed", "-1"], 2, "--seed: seed: input should be"),
         (["find", "a.e57", "--model", "a.stl", "--preset", "shraif2017"], 2, "did you mean 'sharif2017'?"),
         (["find", "none.e57", "--model", "none.stl"], 1, "none.stl"),

@@ -131,6 +131,21 @@ def test_document_and_back_is_the_identity(findings: Findings, models: ModelLibr
     assert again == first.model_copy(update={"detections": without, "peak_memory_bytes": again.peak_memory_bytes})
 
 
+def test_poses_read_back_lie_in_memory_as_the_search_makes_them(findings: Findings, models: ModelLibrary) -> None:
+    # Kernels are compiled for each layout they meet, and isolating again would start with that.
+    told = document(findings, models=model_entries(models), parameters=Settings(), seed=3)
+    for found in findings_of(told):
+        assert found.scene_from_model.rotation.flags.c_contiguous
+        assert found.scene_from_model.translation.flags.c_contiguous
+
+
+def test_a_folder_that_cannot_be_made_is_told_without_our_names(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    told = r"results cannot be written: [^:]*: choose another"
+    with pytest.raises(OutputError, match=told), result_folder(tmp_path / "file" / "out"):
+        pass
+
+
 def test_what_is_written_is_what_is_read(tmp_path: Path, findings: Findings, models: ModelLibrary) -> None:
     written = write_results(findings, tmp_path / "out", models=models, parameters=Settings())
     assert read_results(tmp_path / "out") == written

@@ -29,6 +29,7 @@ def isolate_again(
     tolerance: float | None = None,
     out: str | Path | None = None,
     format: str = "ply",
+    overwrite: bool = False,
     progress: Progress | None = None,
 ) -> schema.Results:
     """Cut the points of a result's detections out of `scans` and write the result anew; returns its results.json.
@@ -37,6 +38,7 @@ def isolate_again(
     scans : the files that were searched, or others in the same frame
     tolerance : points this near to a placed model are its own, metres; None as before
     out : a new folder; None replaces `result_dir`, which stays as it is until the new one stands
+    overwrite : replace an older result in `out`; never anything else
 
     Raises UnreadableFileError for no result or a scan that cannot be read, UsageError for no tolerance, OutputError.
     """
@@ -47,7 +49,7 @@ def isolate_again(
         raise UsageError(msg)
     found, sources, clock = findings_of(before), Sources(list(scans)), Clock()
     with (
-        result_folder(result_dir if out is None else out, overwrite=out is None) as folder,
+        result_folder(result_dir if out is None else out, overwrite=overwrite or out is None) as folder,
         ModelLibrary.open(Path(result_dir) / MODELS) if found else ModelLibrary.in_memory() as models,
         open_remainder(folder / before.remainder, scans) if before.remainder else nullcontext() as rest,
     ):

@@ -106,7 +106,8 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        msg = f"{path}: cannot be read as a TOML settings file: {error}"
+        why = (error.strerror if isinstance(error, OSError) else None) or error
+        msg = f"{path}: cannot be read as a TOML settings file: {why}"
         raise UsageError(msg) from error
 
 
@@ -118,7 +119,7 @@ def environment_layers(environ: Mapping[str, str], known: Sequence[str]) -> list
         if not name.startswith(ENV_PREFIX) or name in ENV_RESERVED:
             continue
         if name not in names:
-            msg = f"{name}: no such setting: {did_you_mean(name, list(names))}, or unset it"
+            msg = f"{name}: no such setting, unset it: {did_you_mean(name, list(names))}"
             raise UsageError(msg)
         layers.append(Layer(name, nested(names[name], _as_toml(environ[name]))))
     return layers
@@ -185,6 +186,9 @@ def _checked(value: object, hint: Any, where: str, name: str) -> Any:
         checked = TypeAdapter(hint).validate_python(value)
     except ValidationError as error:
         first = error.errors()[0]
+        if first["type"] in ("missing", "too_long") and isinstance(value, Sequence):
+            msg = f"{where}: {name}: takes {_length(hint)} values with commas between, got {len(value)}: {value!r}"
+            raise UsageError(msg) from error
         at = "".join(f"[{part}]" for part in first["loc"] if isinstance(part, int))
         msg = f"{where}: {name}{at}: {first['msg'][0].lower()}{first['msg'][1:]}, got {value!r}"
         raise UsageError(msg) from error
@@ -196,6 +200,11 @@ def _checked(value: object, hint: Any, where: str, name: str) -> Any:
 
 def _is_tuple(hint: Any) -> bool:
     return any(get_origin(kind) is tuple for kind in (hint, *get_args(hint)))
+
+
+def _length(hint: Any) -> int:
+    """How many parts the tuple has that the hint asks for."""
+    return next(len(get_args(kind)) for kind in (hint, *get_args(hint)) if get_origin(kind) is tuple)
 
 
 def _as_toml(text: str) -> object:

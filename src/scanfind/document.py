@@ -207,7 +207,8 @@ def _refused(entry: schema.RefusedEntry) -> Refused:
 def _pose(rows: schema.Matrix) -> Pose:
     matrix = np.array(rows)
     Pose.from_matrix(matrix)  # refuses what is no rigid motion; but what it makes orthonormal loses the last digit
-    return Pose(matrix[:3, :3], matrix[:3, 3])
+    # Views would have every kernel that takes a pose compiled once more, which takes 8 s.
+    return Pose(matrix[:3, :3].copy(), matrix[:3, 3].copy())
 
 
 def _or_none(value: float) -> float | None:

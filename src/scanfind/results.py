@@ -50,7 +50,7 @@ def result_folder(out: str | Path, *, overwrite: bool = False) -> Iterator[Path]
         check_free(target, overwrite=overwrite)  # a search takes long enough for somebody else to have come
         _swap(staged, target)
     except OSError as error:  # scans and models say theirs in words of their own
-        msg = f"{out}: results cannot be written: {error}: choose another folder or make room"
+        msg = f"{out}: results cannot be written: {error.strerror or error}: choose another folder or make room"
         raise OutputError(msg) from error
     finally:
         shutil.rmtree(staged, ignore_errors=True)

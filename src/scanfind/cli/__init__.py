@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, MissingArgumentError
 
 from scanfind.cli.find import find
 from scanfind.cli.info import info
@@ -48,6 +48,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
+        if isinstance(error, MissingArgumentError) and "parameter SCAN" in str(error):
+            # `find --model spool.stl shop.e57` reads as two models and no scan.
+            return _fail("no scan given: scans come before --model and other options", UsageError.exit_code)
         return _fail(f"{str(error).rstrip('.')}; see scanfind --help", UsageError.exit_code)
     except ScanfindError as error:
         return _fail(error, error.exit_code)

@@ -18,6 +18,7 @@ def isolate(
     tolerance: Metres | None = None,
     out: Path | None = None,
     format: Format = "ply",
+    overwrite: Flag = False,
     json: Flag = False,
 ) -> None:
     """Cut the points of found instances out of the scans again, without searching.
@@ -38,6 +39,8 @@ def isolate(
         A new folder for the result; without it the points in RESULT_DIR are replaced.
     format
         Of the isolated point clouds.
+    overwrite
+        Replace an older result in --out.
     json
         Print results.json on stdout instead of a table.
 
@@ -47,5 +50,7 @@ def isolate(
     from scanfind.progress import progress_on
 
     with progress_on() as progress:
-        results = isolate_again(result_dir, scans, tolerance=tolerance, out=out, format=format, progress=progress)
+        results = isolate_again(
+            result_dir, scans, tolerance=tolerance, out=out, format=format, overwrite=overwrite, progress=progress
+        )
     report(results, out or result_dir, json=json)

@@ -63,7 +63,7 @@ def add(
     with ModelLibrary.open(lib, create=True) as kept:
         before = len(kept)
         names = add_models(kept, models, run, parameters)
-        note(f"{lib}: {len(names)} models read, {len(kept) - before} new, {len(kept)} in all")
+        note(f"{lib}: models read: {len(names)}, new: {len(kept) - before}, in all: {len(kept)}")
 
 
 @library.command(name="list")
