@@ -7,7 +7,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -132,3 +132,21 @@ class CloudFile(ABC):
         except BaseException:
             self.abort()
             raise
+
+
+class HeaderFirst(CloudFile):
+    """A cloud file whose header has one length: written first, and again when the number of points is known."""
+
+    _file: BinaryIO
+
+    @abstractmethod
+    def _header(self) -> bytes:
+        """The header for so many points as there are now."""
+
+    def _finish(self) -> None:
+        self._file.seek(0)
+        self._file.write(self._header())
+        self._file.close()
+
+    def _discard(self) -> None:
+        self._file.close()

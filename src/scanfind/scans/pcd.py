@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scanfind.cloud import CHUNK_POINTS, Floats, PointChunk, ScanInfo, Station
 from scanfind.errors import UnreadableFileError
 from scanfind.scans.fields import COLOURS, beyond_8_bits, has_colours, header_words, preview
-from scanfind.scans.output import CloudFile, Columns
+from scanfind.scans.output import Columns, HeaderFirst
 from scanfind.scans.pcd_header import PcdHeader, read_header
 from scanfind.scans.records import (
     Block,
@@ -148,7 +148,7 @@ def packed(red: NDArray[Any], green: NDArray[Any], blue: NDArray[Any]) -> NDArra
     return number.view(np.float32)
 
 
-class Writer(CloudFile):
+class Writer(HeaderFirst):
     """Binary PCD, as PCL, Open3D and CloudCompare open it and `read` gives it back.
 
     - x y z are F 4 as long as that is exact, as it is for points that came from a camera or another PCD, and F 8 from
@@ -183,14 +183,6 @@ class Writer(CloudFile):
         for word, name in self._names.items():
             records[word] = columns[name]
         self._file.write(records.view(np.uint8).data)
-
-    def _finish(self) -> None:
-        self._file.seek(0)
-        self._file.write(self._header())
-        self._file.close()
-
-    def _discard(self) -> None:
-        self._file.close()
 
     def _widen(self) -> None:
         """Write again in double what has been written in single precision."""

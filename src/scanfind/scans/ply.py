@@ -16,7 +16,7 @@ import numpy as np
 from scanfind.cloud import Floats, PointChunk, ScanInfo, Station
 from scanfind.errors import UnreadableFileError
 from scanfind.scans.fields import COLOURS, EXACT_COLOURS, NORMALS, beyond_8_bits, has_colours, header_words, preview
-from scanfind.scans.output import CloudFile, Columns
+from scanfind.scans.output import Columns, HeaderFirst
 from scanfind.scans.ply_header import SPELLED, Element, PlyHeader, read_header
 from scanfind.scans.records import (
     Block,
@@ -101,7 +101,7 @@ def _skip_bytes(file: BinaryIO, count: int, size: int, name: str) -> None:
     file.seek(count, os.SEEK_CUR)
 
 
-class Writer(CloudFile):
+class Writer(HeaderFirst):
     """Binary little endian PLY, as CloudCompare and MeshLab show it and `read` gives it back.
 
     - x y z are double always: a shift is not needed, and readers would not know of it.
@@ -129,14 +129,6 @@ class Writer(CloudFile):
             is_preview = dtype == np.uint8 and values.dtype == np.uint16
             records[name] = preview(values, scaled=self._scaled) if is_preview else values
         self._file.write(records.view(np.uint8).data)
-
-    def _finish(self) -> None:
-        self._file.seek(0)
-        self._file.write(self._header())
-        self._file.close()
-
-    def _discard(self) -> None:
-        self._file.close()
 
     def _header(self) -> bytes:
         """The header for so many points as there are now, of one length however many they are."""
