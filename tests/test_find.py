@@ -463,7 +463,7 @@ def test_sparse_scans_of_a_shop_have_no_ghosts(spools: tuple[Mesh, ModelLibrary]
 
 
 def test_a_part_on_a_floor_is_never_found_sunk_into_it() -> None:
-    """Flush with the floor, half of the part lies on the scan and the other half is hidden: no evidence for it at all."""
+    """Flush with the floor, half of the part lies on the scan and the other half is hidden: no evidence for it."""
     part = blocks("angle", [((-0.5, -0.3, 0), (0.5, 0.3, 0.1)), ((-0.5, -0.3, 0.1), (-0.4, 0.3, 0.75))])
     place = Pose.from_rotation_vector([0.0, 0.0, 0.6], [1.5, -0.8, 0.0])
     floor = SceneObject("floor", box(8.0, 8.0, 0.2), Pose(np.eye(3), np.array([-4.0, -4.0, -0.2])))
