@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 from scanfind.cli import main
-from scanfind.cli.tables import table, turned
+from scanfind.cli.tables import closest, table, turned
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose
 from scanfind.results import read_results
 from scanfind.scans import open_writer, read_scan
+from scanfind.schema import ModelEntry, Results
 from scanfind.simulate.objects import pipe_spool
 from scanfind.simulate.scanner import scan
 from scanfind.simulate.scene import Scene, SceneObject
@@ -311,6 +312,13 @@ def test_numbers_stand_on_the_right() -> None:
         "12  Ø      10.25       –",
     ]
     assert table(("id",), []) == "id"
+
+
+def test_where_nothing_looks_like_a_model_its_size_is_told() -> None:
+    spool = ModelEntry(name="spool", sha256="", diameter_m=3501.98, pairs=0)
+    (line,) = closest(Results.model_construct(models=[spool], detections=[], refused=[]))
+    assert line.startswith("spool: not found: ")
+    assert line.endswith("3,501.980 m across")
 
 
 def test_angles_are_yaw_pitch_roll() -> None:

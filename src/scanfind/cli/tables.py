@@ -45,7 +45,8 @@ def closest(results: Results) -> list[str]:
             x, y, z = (row[3] for row in best.scene_from_model[:3])
             where = f"the closest was at {x:.3f} {y:.3f} {z:.3f} m, score {_number(best.score, 2)}: {best.reason}"
         else:
-            where = "no part of the scene looks like it"
+            # Mistaken units are the commonest cause, and the size is what shows them.
+            where = f"no part of the scene looks like it, which is {model.diameter_m:,.3f} m across"
         lines.append(f"{model.name}: not found: {where}")
     return lines
 
