@@ -27,6 +27,9 @@ Floats = NDArray[np.float64]
 
 BATCHES = 3  # of hypotheses refined a round, each far from where those before it went
 CLAIM_CELLS = 2  # a detection claims the surfels up to so many cells around those that support its samples
+# Without scanner positions: a second instance shows at least this much of what the best one shows (another spool in a
+# shop: 0.61).
+BLIND_SHARE = 0.7
 REFUSED_SHOWN = 3  # of each model: what came closest
 
 
@@ -174,9 +177,22 @@ class Recognition:
                 self.search.learn(best.model, self._hits(hypotheses, best), best.evidence.support())
             believed.append(best)
             self._claim(best, claimed)
-        self.believed = believed
+        self.believed = self._shown_alike(believed) if self.blind else believed
         self._refused = closest(self._refused)
         self.search.withdraw(np.flatnonzero(claimed))
+
+    def _shown_alike(self, believed: Sequence[Candidate]) -> list[Candidate]:
+        """Of each model those that show nearly as much of themselves as the best one: where free space says nothing, a
+        part that resembles the model lies on the scan with half of its samples, as one half hidden would.
+        """
+        most = {c.model: 0.0 for c in believed}
+        for candidate in believed:
+            most[candidate.model] = max(most[candidate.model], candidate.evidence.support())
+        alike = [c for c in believed if c.evidence.support() >= BLIND_SHARE * most[c.model]]
+        kept = {id(c) for c in alike}
+        reason = "much less of it lies on the scan than of another instance, and no free space is known to tell why"
+        self._refused.extend((c, reason) for c in believed if id(c) not in kept)
+        return alike
 
     def _claim(self, candidate: Candidate, claimed: NDArray[np.bool_]) -> None:
         """Mark the surface a pose claims: its samples are too few to name every surfel of it themselves."""
