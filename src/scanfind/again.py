@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scanfind import schema
-from scanfind.clock import Clock, watched
+from scanfind.clock import Clock, say_if_compiling, watched
 from scanfind.detection import Findings
 from scanfind.document import findings_of
 from scanfind.errors import UsageError
@@ -55,6 +55,7 @@ def isolate_again(
     ):
         with clock("isolate"):
             tell = progress or (lambda stage, done, total: None)
+            say_if_compiling(tell)
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
             findings = Findings(with_points(found, models.models(), chunks, within, rest))
         findings.refused, findings.notes = found.refused, found.notes

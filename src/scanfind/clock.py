@@ -62,3 +62,14 @@ def watched(
         yield chunk
         done += len(chunk) + chunk.dropped
         tell(stage, done, expected)
+
+
+def say_if_compiling(tell: Progress) -> None:
+    """Tell the stage "compile" where the kernels of a search or of isolation must be compiled first: once a machine."""
+    from scanfind.kernels import COMPILE_S, compiled
+    from scanfind.kernels.distance import distances
+    from scanfind.kernels.search import test_pairs
+    from scanfind.kernels.surfels import fit_surfels
+
+    if not compiled(distances, test_pairs, fit_surfels):
+        tell("compile", 0.0, COMPILE_S)

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scanfind.clock import Clock, watched
+from scanfind.clock import Clock, say_if_compiling, watched
 from scanfind.cloud import CloudModel, PointChunk, shift_for
 from scanfind.detection import Findings
 from scanfind.deviation import deviation_of
 from scanfind.errors import UsageError, require
 from scanfind.isolate import IsolateParameters, Placed
 from scanfind.isolate import isolate as isolate_raw
-from scanfind.kernels import COMPILE_S, compiled, use_threads
+from scanfind.kernels import use_threads
 from scanfind.library import ModelLibrary, joint_table
 from scanfind.mesh import Mesh
 from scanfind.model import Model, ModelParameters
@@ -72,8 +72,7 @@ def find(
     clock, tell = Clock(), progress or (lambda stage, done, total: None)
     findings = Findings()
 
-    if not compiled():
-        tell("compile", 0.0, COMPILE_S)  # once a machine; whoever listens can say so
+    say_if_compiling(tell)
 
     with clock("read"):
         sources = Sources(scans, origin)

@@ -124,7 +124,8 @@ def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters) -
     missing = 1.0 - evidence.visible_support()
     if 1.0 - missing * parameters.penalty_weight < parameters.min_score:
         return f"beams passed through {missing:.0%} of the surface that scanners should have seen"
-    return "what lies on the scan is too little, or of a shape the scan is full of (floors, walls), to tell"
+    reached = f"score {score(evidence, blind, parameters):.4f}, {parameters.min_score} is asked for"
+    return f"what lies on the scan is too little, or of a shape the scan is full of (floors, walls), to tell: {reached}"
 
 
 def gather(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 COMPILE_S = 20.0  # roughly, on two cores, for the kernels of one search
 
@@ -14,11 +15,13 @@ def use_threads(jobs: int) -> None:
     numba.set_num_threads(max(1, min(jobs, numba.config.NUMBA_NUM_THREADS)))
 
 
-def compiled() -> bool:
-    """Have the kernels been compiled on this machine before, so that they only need loading?"""
-    from scanfind.kernels.search import test_pairs
+def compiled(*kernels: Any) -> bool:
+    """Have kernels been compiled on this machine before, so that they only need loading?"""
+    return all(_is_cached(kernel) for kernel in kernels)
 
+
+def _is_cached(kernel: Any) -> bool:
     # Numba has no public way to ask; without its cache every start compiles, and saying so is right.
-    cache = getattr(test_pairs, "_cache", None)
-    folder = getattr(cache, "cache_path", None)
-    return folder is not None and any(Path(folder).glob("search.test_pairs-*.nbc"))
+    folder = getattr(getattr(kernel, "_cache", None), "cache_path", None)
+    name = f"{kernel.__module__.rpartition('.')[2]}.{kernel.__name__}"
+    return folder is not None and any(Path(folder).glob(f"{name}-*.nbc"))

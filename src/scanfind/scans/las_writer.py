@@ -104,7 +104,12 @@ def _fitted(values: NDArray[Any], dimension: Any) -> NDArray[Any]:
     """The values as near as a dimension of the point format can have them."""
     if dimension.dtype is not None and dimension.dtype.kind == "f":
         return values.astype(dimension.dtype, copy=False)
-    whole = np.rint(np.nan_to_num(values)) if values.dtype.kind == "f" else values
+    if values.dtype.kind == "f":
+        values = np.nan_to_num(values)
+        # A share, as E57 has intensities: rounded to 0 and 1 it would show black in every viewer.
+        shares = len(values) > 0 and values.min() >= 0.0 and values.max() <= 1.0
+        values = np.rint(values * dimension.max if shares and dimension.max > 255 else values)
+    whole = values
     fitted: NDArray[Any] = np.clip(whole, dimension.min, dimension.max).astype(dimension.dtype or np.uint8)
     return fitted
 
