@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -88,10 +89,12 @@ def build_scene(
             grid = grid.coarser()
     half = grid.coarser()
     fine = grid.surfels(parameters.min_neighbours, jobs)
-    coarse = half.surfels(parameters.min_neighbours, jobs)
-    around = half.coarser().surfels(1, jobs)
     test_cell = max(diameter / test_cells_across, 2.0 * grid.cell)
-    tolerant = orientation_grid(fine, 0.5 * test_cell, test_cell)
+    with ThreadPoolExecutor(1) as beside:  # marking is one long loop: a second core does the coarser levels meanwhile
+        marked = beside.submit(orientation_grid, fine, 0.5 * test_cell, test_cell)
+        coarse = half.surfels(parameters.min_neighbours, jobs)
+        around = half.coarser().surfels(1, jobs)
+        tolerant = marked.result()
     bends = flatness_around(fine, around)
     return Scene(
         fine,

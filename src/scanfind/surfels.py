@@ -242,41 +242,48 @@ class MomentGrid:
 
         self._release()
         used = int(self._counts[0])
-        order = np.argsort(self._block_keys[:used])
-        slots = self._block_keys[:used][order]
-        slot_cells = self._block_cells[:used][order]
-        block_keys, slot_starts = np.unique(slots >> VIEW_BITS << VIEW_BITS, return_index=True)
-        slot_starts = np.append(slot_starts, used)
-        hash_keys, hash_values = empty_hash(len(block_keys))
+        slots, slot_cells = np.argsort(self._block_keys[:used]), self._block_cells
+        block_keys, slot_starts = np.unique(self._block_keys[:used][slots] >> VIEW_BITS << VIEW_BITS, return_index=True)
+        slot_starts, blocks = np.append(slot_starts, used), len(block_keys)
+        hash_keys, hash_values = empty_hash(blocks)
         fill_hash(block_keys, hash_keys, hash_values)
 
-        first_cell = np.concatenate([[0], np.cumsum(count_cells(slot_starts, slot_cells))])
+        counts = np.empty(blocks, np.int64)
+        in_threads(jobs, blocks, lambda start, stop: count_cells(start, stop, slot_starts, slots, slot_cells, counts))
+        first_cell = np.concatenate([[0], np.cumsum(counts)])
         cells = int(first_cell[-1])
-        block_cells = np.empty((len(block_keys), 512), np.int32)
+        block_cells = np.empty((blocks, 512), np.int32)
         cell_locals, totals = np.empty(cells, np.int16), np.empty((cells, 10), np.float32)
-        number_cells(slot_starts, slot_cells, first_cell, self._moments, block_cells, cell_locals, totals)
-
-        sides = np.empty(cells, np.int64)
-        # The face first met, and the other one, which few cells have: its arrays stay addresses without memory.
-        front, back = (np.empty((cells, 8)) for _ in range(2))
         in_threads(
-            jobs, len(block_keys),
-            lambda start, stop: fit_surfels(
-                start, stop, block_keys, hash_keys, hash_values, slot_starts, slot_cells, self._moments, block_cells,
-                first_cell, cell_locals, totals, self.cell, self._units, min_neighbours,
-                sides, front, back,
+            jobs, blocks,
+            lambda start, stop: number_cells(
+                start, stop, slot_starts, slots, slot_cells, first_cell, self._moments, block_cells, cell_locals, totals
             ),
         )  # fmt: skip
-        first_surfel = np.concatenate([[0], np.cumsum(sides)])
-        fitted = front
-        if first_surfel[-1] > cells:
-            fitted, two = np.empty((first_surfel[-1], 8)), sides == 2
-            fitted[first_surfel[:-1]] = front
-            fitted[first_surfel[:-1][two] + 1] = back[two]
+
+        sides, means, normals = np.empty(cells, np.int64), np.empty((cells, 3)), np.empty((cells, 3))
+        flatness, points = np.empty(cells), np.empty(cells)
+        backs = np.empty((cells, 8))  # few cells have a second face: most of it stays addresses without memory
+        in_threads(
+            jobs, blocks,
+            lambda start, stop: fit_surfels(
+                start, stop, block_keys, hash_keys, hash_values, slot_starts, slots, slot_cells, self._moments,
+                block_cells, first_cell, cell_locals, totals, self.cell, self._units, min_neighbours,
+                sides, means, normals, flatness, points, backs,
+            ),
+        )  # fmt: skip
+        two = np.flatnonzero(sides == 2)
+        if len(two):
+            # A cell's second face stands right behind its first.
+            back = backs[two]
+            means, normals = (
+                np.insert(a, two + 1, b, axis=0) for a, b in ((means, back[:, :3]), (normals, back[:, 3:6]))
+            )
+            flatness, points = (np.insert(a, two + 1, b) for a, b in ((flatness, back[:, 6]), (points, back[:, 7])))
+        first_surfel = np.concatenate([[0], np.cumsum(sides)]).astype(np.int32)
         return Surfels(
             self.cell, np.zeros(3) if self.offset is None else self.offset, hash_keys, hash_values, block_keys,
-            block_cells, first_surfel.astype(np.int32), np.ascontiguousarray(fitted[:, :3]),
-            np.ascontiguousarray(fitted[:, 3:6]), fitted[:, 6].copy(), fitted[:, 7].copy(), self.signed,
+            block_cells, first_surfel, means, normals, flatness, points, self.signed,
         )  # fmt: skip
 
 

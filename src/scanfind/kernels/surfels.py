@@ -47,36 +47,37 @@ def smallest_eigenvector(a00, a01, a02, a11, a12, a22):
 
 
 @njit(cache=True, nogil=True)
-def count_cells(slot_starts, slot_cells):
-    """Occupied cells of each block, wherever they were seen from, (B,).
+def count_cells(start, stop, slot_starts, slots, slot_cells, counts):
+    """Occupied cells of blocks start … stop, wherever they were seen from, into counts (B,).
 
-    slot_starts : (B+1,) which slots (block × view) belong to each block
+    slot_starts : (B+1,) which places in `slots` belong to each block; slots : which slot (block × view) it is
     slot_cells : (slots, 512) row of moments, -1 for empty
     """
-    counts = np.zeros(slot_starts.shape[0] - 1, np.int64)
-    for block in range(counts.shape[0]):
+    for block in range(start, stop):
+        counts[block] = 0
         for local in range(512):
             for slot in range(slot_starts[block], slot_starts[block + 1]):
-                if slot_cells[slot, local] >= 0:
+                if slot_cells[slots[slot], local] >= 0:
                     counts[block] += 1
                     break
-    return counts
 
 
 @njit(cache=True, nogil=True)
-def number_cells(slot_starts, slot_cells, first_cell, moments, block_cells, cell_locals, totals):
-    """Number the cells block by block and sum their views.
+def number_cells(
+    start, stop, slot_starts, slots, slot_cells, first_cell, moments, block_cells, cell_locals, totals
+):  # fmt: skip
+    """Number the cells of blocks start … stop and sum their views.
 
     block_cells : (B, 512) out: number of each cell, -1 for empty
     totals : (V, 10) float32 out: n, Σx, Σxxᵀ of each cell, all views together; 40 bytes that the 27 cells around read
     """
-    for block in range(slot_starts.shape[0] - 1):
+    for block in range(start, stop):
         cell = first_cell[block]
         for local in range(512):
             block_cells[block, local] = -1
             occupied = False
             for slot in range(slot_starts[block], slot_starts[block + 1]):
-                row = slot_cells[slot, local]
+                row = slot_cells[slots[slot], local]
                 if row >= 0:
                     for k in range(10):
                         totals[cell, k] = moments[row, k] + (totals[cell, k] if occupied else 0.0)
@@ -115,26 +116,19 @@ def plane_of(pool):
 
 
 @njit(cache=True, nogil=True)
-def write_fit(fits, c, x, y, z, nx, ny, nz, variance, unit, points):
-    """Write one surfel: mean, normal, spread across its plane (variance is in offset units), points."""
-    fits[c, 0], fits[c, 1], fits[c, 2] = x, y, z
-    fits[c, 3], fits[c, 4], fits[c, 5] = nx, ny, nz
-    fits[c, 6], fits[c, 7] = sqrt(max(variance, 0.0)) * unit, points
-
-
-@njit(cache=True, nogil=True)
 def fit_surfels(
-    first_block, last_block, block_keys, hash_keys, hash_values, slot_starts, slot_cells, moments,
+    first_block, last_block, block_keys, hash_keys, hash_values, slot_starts, slots, slot_cells, moments,
     block_cells, first_cell, cell_locals, totals, cell, units, min_neighbours,
-    n_sides, front_fits, back_fits,
+    n_sides, means, normals, flatness, points, backs,
 ):  # fmt: skip
     """Fit one or two surfels in every cell of some blocks.
 
     cell : edge, metres; units : offset units a cell
     min_neighbours : occupied cells of the 3×3×3 a normal needs, the cell itself included
     n_sides : (V,) out: 1, or 2 where the scanners saw both faces of something thin
-    front_fits, back_fits : (V, 8) out: mean (3), metres from the grid's offset; normal (3), unit, towards the scanner,
-        zero where there are too few neighbours; standard deviation across the pooled plane, metres; points
+    means : (V, 3) out, metres from the grid's offset; normals : (V, 3) out, unit, towards the scanner, zero where there
+        are too few neighbours; flatness : (V,) out, standard deviation across the pooled plane, metres; points : (V,)
+    backs : (V, 8) out: the same of a second face, end to end
     """
     unit = cell / units
     pool = np.zeros(10)
@@ -175,7 +169,7 @@ def fit_surfels(
             # A thin plate scanned from both sides: its views disagree about the side.
             front = back = toward = 0.0
             for slot in range(slot_starts[block], slot_starts[block + 1]):
-                row = slot_cells[slot, local]
+                row = slot_cells[slots[slot], local]
                 if row >= 0:
                     along = moments[row, 10] * nx + moments[row, 11] * ny + moments[row, 12] * nz
                     toward += along
@@ -190,10 +184,10 @@ def fit_surfels(
                 if occupied < min_neighbours:
                     sign = 0.0
                 n = totals[c, 0]
-                write_fit(
-                    front_fits, c, cx + totals[c, 1] / n * unit, cy + totals[c, 2] / n * unit,
-                    cz + totals[c, 3] / n * unit, sign * nx, sign * ny, sign * nz, low, unit, n,
-                )  # fmt: skip
+                means[c, 0], means[c, 1] = cx + totals[c, 1] / n * unit, cy + totals[c, 2] / n * unit
+                means[c, 2] = cz + totals[c, 3] / n * unit
+                normals[c, 0], normals[c, 1], normals[c, 2] = sign * nx, sign * ny, sign * nz
+                flatness[c], points[c] = sqrt(max(low, 0.0)) * unit, n
                 continue
             for s in range(2):
                 sign = 1.0 - 2.0 * s
@@ -207,7 +201,7 @@ def fit_surfels(
                     there, other = neighbour_local[k], neighbour_block[k]
                     seen = False
                     for slot in range(slot_starts[other], slot_starts[other + 1]):
-                        row = slot_cells[slot, there]
+                        row = slot_cells[slots[slot], there]
                         if row >= 0:
                             along = moments[row, 10] * nx + moments[row, 11] * ny + moments[row, 12] * nz
                             if along * sign > 0.0:
@@ -226,8 +220,13 @@ def fit_surfels(
                 if occupied >= min_neighbours:
                     mx, my, mz, low, _, _ = plane_of(pool)
                 flip = -1.0 if toward_x * mx + toward_y * my + toward_z * mz < 0.0 else 1.0
-                n = side[0]
-                write_fit(
-                    front_fits if s == 0 else back_fits, c, cx + side[1] / n * unit, cy + side[2] / n * unit,
-                    cz + side[3] / n * unit, flip * mx, flip * my, flip * mz, low, unit, n,
-                )  # fmt: skip
+                n, spread = side[0], sqrt(max(low, 0.0)) * unit
+                x, y, z = cx + side[1] / n * unit, cy + side[2] / n * unit, cz + side[3] / n * unit
+                if s == 0:
+                    means[c, 0], means[c, 1], means[c, 2] = x, y, z
+                    normals[c, 0], normals[c, 1], normals[c, 2] = flip * mx, flip * my, flip * mz
+                    flatness[c], points[c] = spread, n
+                else:
+                    backs[c, 0], backs[c, 1], backs[c, 2] = x, y, z
+                    backs[c, 3], backs[c, 4], backs[c, 5] = flip * mx, flip * my, flip * mz
+                    backs[c, 6], backs[c, 7] = spread, n
