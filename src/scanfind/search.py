@@ -383,10 +383,10 @@ class Bins(NamedTuple):
 
 def bin_pool(pool: NDArray[np.intp], means: Floats, edge: float) -> Bins:
     """Sort surfels into cubes of an edge in metres."""
-    from scanfind.kernels.blocks import BIAS, VIEW_BITS, fill_hash
+    from scanfind.kernels.blocks import BIAS, fill_hash
 
     x, y, z = (np.floor(means[pool] / edge).astype(np.int64) + BIAS).T
-    keys = (x << 44) | (y << 25) | (z << VIEW_BITS)
+    keys = (x << 40) | (y << 20) | z
     order = np.argsort(keys, kind="stable")
     bins, starts = np.unique(keys[order], return_index=True)
     hash_keys, hash_values = empty_hash(len(bins))

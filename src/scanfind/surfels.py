@@ -21,11 +21,11 @@ Ints = NDArray[np.int64]
 DEPTH_PIXELS = 360  # along an edge of the cube map: 0.25° a pixel, 35 mm at 8 m
 # Where a scan has fewer beams than pixels, pixels are joined until most of what was looked at has a range.
 MOST_HOLES, LEAST_DEPTH_PIXELS = 0.15, 45
-# Room to begin with: 134 MB and 436 MB of addresses, of which only what is written becomes memory. From 2^14 and 2^20
+# Room to begin with: 134 MB and 470 MB of addresses, of which only what is written becomes memory. From 2^14 and 2^20
 # on, doubling took 0.9 s of a pass over 10 M points that needs 0.8 s.
 EMPTY_BLOCKS, EMPTY_ROWS = 1 << 16, 1 << 22
 POINTS_TO_SETTLE = 1000  # of which the median says where the scan lies
-ROWS_AT_ONCE = 64  # what one block may ask for (kernels.grid.sum_children)
+ROWS_AT_ONCE = 64 * 54  # what one block may ask for (kernels.grid.sum_children)
 
 
 @dataclass(frozen=True)
@@ -134,6 +134,7 @@ class MomentGrid:
         self._block_keys = np.empty(EMPTY_BLOCKS, np.int64)
         self._block_cells = np.empty((EMPTY_BLOCKS, 512), np.int32)
         self._moments = np.empty((EMPTY_ROWS, MOMENTS), np.int64)
+        self._links = np.empty((EMPTY_ROWS, 2), np.int32)
         self._counts = np.zeros(3, np.int64)
         self._held: list[PointChunk] = []
         self._depths: dict[tuple[float, ...], NDArray[np.float32]] = {}
@@ -158,7 +159,7 @@ class MomentGrid:
         while True:
             at = accumulate(
                 chunk.xyz, at, origin, has_origin, self.offset, self.cell, self._hash_keys, self._hash_values,
-                self._block_keys, self._block_cells, self._moments, self._counts, ranges, DEPTH_PIXELS,
+                self._block_keys, self._block_cells, self._moments, self._links, self._counts, ranges, DEPTH_PIXELS,
             )  # fmt: skip
             if at == len(chunk):
                 break
@@ -195,7 +196,7 @@ class MomentGrid:
             self._hash_values = np.zeros(len(self._hash_keys), np.int32)
             fill_hash(self._block_keys[: self._counts[0]], self._hash_keys, self._hash_values)
         if self._counts[1] + ROWS_AT_ONCE > len(self._moments):
-            self._moments = doubled(self._moments)
+            self._moments, self._links = doubled(self._moments), doubled(self._links)
 
     def points_per_row(self) -> float:
         """Raw points a cell, on average, counting a cell once for each view."""
@@ -215,9 +216,9 @@ class MomentGrid:
         at = 0
         while True:
             at = sum_children(
-                at, self._block_keys[:blocks], self._block_cells, self._moments, np.int64(self._units / 2),
+                at, self._block_keys[:blocks], self._block_cells, self._moments, self._links, np.int64(self._units / 2),
                 parent._hash_keys, parent._hash_values, parent._block_keys, parent._block_cells, parent._moments,
-                parent._counts,
+                parent._links, parent._counts,
             )  # fmt: skip
             if at == blocks:
                 return parent
@@ -236,46 +237,46 @@ class MomentGrid:
 
         min_neighbours : see GridParameters; jobs : threads, on which the result does not depend
         """
-        from scanfind.kernels.blocks import VIEW_BITS, fill_hash
+        from scanfind.kernels.blocks import fill_hash
         from scanfind.kernels.surfels import count_cells, fit_surfels, number_cells
         from scanfind.threads import in_threads
 
         self._release()
         used = int(self._counts[0])
-        slots, slot_cells = np.argsort(self._block_keys[:used]), self._block_cells
-        block_keys, slot_starts = np.unique(self._block_keys[:used][slots] >> VIEW_BITS << VIEW_BITS, return_index=True)
-        slot_starts, blocks = np.append(slot_starts, used), len(block_keys)
-        hash_keys, hash_values = empty_hash(blocks)
+        order = np.argsort(self._block_keys[:used])
+        block_keys = self._block_keys[order]
+        hash_keys, hash_values = empty_hash(used)
         fill_hash(block_keys, hash_keys, hash_values)
 
-        counts = np.empty(blocks, np.int64)
-        in_threads(jobs, blocks, lambda start, stop: count_cells(start, stop, slot_starts, slots, slot_cells, counts))
+        counts = np.empty(used, np.int64)
+        in_threads(jobs, used, lambda start, stop: count_cells(start, stop, order, self._block_cells, counts))
         first_cell = np.concatenate([[0], np.cumsum(counts)])
         cells = int(first_cell[-1])
-        block_cells = np.empty((blocks, 512), np.int32)
-        cell_locals, totals = np.empty(cells, np.int16), np.empty((cells, 10), np.float32)
+        block_cells = np.empty((used, 512), np.int32)
+        cell_locals, cell_rows = np.empty(cells, np.int16), np.empty(cells, np.int32)
+        totals = np.empty((cells, 10), np.float32)
         in_threads(
-            jobs, blocks,
+            jobs, used,
             lambda start, stop: number_cells(
-                start, stop, slot_starts, slots, slot_cells, first_cell, self._moments, block_cells, cell_locals, totals
+                start, stop, order, self._block_cells, first_cell, self._moments, self._links, block_cells,
+                cell_locals, cell_rows, totals,
             ),
         )  # fmt: skip
 
         sides, means, normals = np.empty(cells, np.int64), np.empty((cells, 3)), np.empty((cells, 3))
         flatness, points = np.empty(cells), np.empty(cells)
-        backs = np.empty((cells, 8))  # few cells have a second face: most of it stays addresses without memory
-        in_threads(
-            jobs, blocks,
+        backs = in_threads(
+            jobs, used,
             lambda start, stop: fit_surfels(
-                start, stop, block_keys, hash_keys, hash_values, slot_starts, slots, slot_cells, self._moments,
-                block_cells, first_cell, cell_locals, totals, self.cell, self._units, min_neighbours,
-                sides, means, normals, flatness, points, backs,
+                start, stop, block_keys, hash_keys, hash_values, self._moments, self._links, block_cells,
+                first_cell, cell_locals, cell_rows, totals, self.cell, self._units, min_neighbours,
+                sides, means, normals, flatness, points,
             ),
         )  # fmt: skip
         two = np.flatnonzero(sides == 2)
         if len(two):
             # A cell's second face stands right behind its first.
-            back = backs[two]
+            back = np.concatenate(backs)
             means, normals = (
                 np.insert(a, two + 1, b, axis=0) for a, b in ((means, back[:, :3]), (normals, back[:, 3:6]))
             )

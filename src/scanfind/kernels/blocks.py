@@ -9,21 +9,20 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-BIAS = 1 << 18  # block coordinates are packed as 19 bits an axis: ± 262,144 blocks, ± 42 km with cells of 2 cm
-VIEW_BITS = 6  # below them the bin of the view direction: a cell keeps what it was seen from apart
+BIAS = 1 << 19  # block coordinates are packed as 20 bits an axis: ± 524,288 blocks, ± 84 km with cells of 2 cm
 EMPTY = np.int64(-1)
 
 
 @njit(cache=True, nogil=True)
 def pack_block(bx, by, bz):
-    """One int64 for a block's coordinates; the lowest bits are left free for the bin of the view direction."""
-    return ((np.int64(bx) + BIAS) << 44) | ((np.int64(by) + BIAS) << 25) | ((np.int64(bz) + BIAS) << VIEW_BITS)
+    """One int64, never negative, for a block's coordinates."""
+    return ((np.int64(bx) + BIAS) << 40) | ((np.int64(by) + BIAS) << 20) | (np.int64(bz) + BIAS)
 
 
 @njit(cache=True, nogil=True)
 def unpack_block(key):
     """The block coordinates `pack_block` was given."""
-    return (key >> 44) - BIAS, ((key >> 25) & 0x7FFFF) - BIAS, ((key >> VIEW_BITS) & 0x7FFFF) - BIAS
+    return (key >> 40) - BIAS, ((key >> 20) & 0xFFFFF) - BIAS, (key & 0xFFFFF) - BIAS
 
 
 @njit(cache=True, nogil=True)

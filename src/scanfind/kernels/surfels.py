@@ -47,45 +47,47 @@ def smallest_eigenvector(a00, a01, a02, a11, a12, a22):
 
 
 @njit(cache=True, nogil=True)
-def count_cells(start, stop, slot_starts, slots, slot_cells, counts):
-    """Occupied cells of blocks start … stop, wherever they were seen from, into counts (B,).
+def count_cells(start, stop, blocks, rows, counts):
+    """Occupied cells of blocks start … stop, into counts (B,).
 
-    slot_starts : (B+1,) which places in `slots` belong to each block; slots : which slot (block × view) it is
-    slot_cells : (slots, 512) row of moments, -1 for empty
+    blocks : (B,) the blocks in order; rows : (blocks, 512) a row of each cell's moments, -1 for an empty one
     """
     for block in range(start, stop):
         counts[block] = 0
         for local in range(512):
-            for slot in range(slot_starts[block], slot_starts[block + 1]):
-                if slot_cells[slots[slot], local] >= 0:
-                    counts[block] += 1
-                    break
+            if rows[blocks[block], local] >= 0:
+                counts[block] += 1
 
 
 @njit(cache=True, nogil=True)
 def number_cells(
-    start, stop, slot_starts, slots, slot_cells, first_cell, moments, block_cells, cell_locals, totals
+    start, stop, blocks, rows, first_cell, moments, links, block_cells, cell_locals, cell_rows, totals
 ):  # fmt: skip
     """Number the cells of blocks start … stop and sum their views.
 
-    block_cells : (B, 512) out: number of each cell, -1 for empty
+    block_cells : (B, 512) out: number of each cell, -1 for empty; cell_rows : (V,) out: a row of each cell's moments
     totals : (V, 10) float32 out: n, Σx, Σxxᵀ of each cell, all views together; 40 bytes that the 27 cells around read
     """
+    views = np.zeros(10, np.int64)
     for block in range(start, stop):
         cell = first_cell[block]
         for local in range(512):
+            row = np.int64(rows[blocks[block], local])
             block_cells[block, local] = -1
-            occupied = False
-            for slot in range(slot_starts[block], slot_starts[block + 1]):
-                row = slot_cells[slots[slot], local]
-                if row >= 0:
-                    for k in range(10):
-                        totals[cell, k] = moments[row, k] + (totals[cell, k] if occupied else 0.0)
-                    occupied = True
-            if occupied:
-                block_cells[block, local] = cell
-                cell_locals[cell] = local
-                cell += 1
+            if row < 0:
+                continue
+            block_cells[block, local] = cell
+            cell_locals[cell] = local
+            cell_rows[cell] = row
+            # Summed as integers first: the views of a cell are chained in the order the points came in.
+            views[:] = 0
+            while row >= 0:
+                for k in range(10):
+                    views[k] += moments[row, k]
+                row = np.int64(links[row, 1])
+            for k in range(10):
+                totals[cell, k] = views[k]
+            cell += 1
 
 
 @njit(cache=True, nogil=True)
@@ -117,9 +119,9 @@ def plane_of(pool):
 
 @njit(cache=True, nogil=True)
 def fit_surfels(
-    first_block, last_block, block_keys, hash_keys, hash_values, slot_starts, slots, slot_cells, moments,
-    block_cells, first_cell, cell_locals, totals, cell, units, min_neighbours,
-    n_sides, means, normals, flatness, points, backs,
+    first_block, last_block, block_keys, hash_keys, hash_values, moments, links, block_cells,
+    first_cell, cell_locals, cell_rows, totals, cell, units, min_neighbours,
+    n_sides, means, normals, flatness, points,
 ):  # fmt: skip
     """Fit one or two surfels in every cell of some blocks.
 
@@ -128,15 +130,15 @@ def fit_surfels(
     n_sides : (V,) out: 1, or 2 where the scanners saw both faces of something thin
     means : (V, 3) out, metres from the grid's offset; normals : (V, 3) out, unit, towards the scanner, zero where there
         are too few neighbours; flatness : (V,) out, standard deviation across the pooled plane, metres; points : (V,)
-    backs : (V, 8) out: the same of a second face, end to end
+    Returns the second faces, (cells with two, 8): mean, normal, flatness, points, in the order of the cells.
     """
     unit = cell / units
+    backs, back_count = np.empty((first_cell[last_block] - first_cell[first_block], 8)), 0
     pool = np.zeros(10)
     side = np.zeros(10)
     around = np.empty(27, np.int64)
     neighbour_cell = np.empty(27, np.int64)
-    neighbour_block = np.empty(27, np.int64)
-    neighbour_local = np.empty(27, np.int64)
+    views = np.zeros((1, 13), np.int64)
     for block in range(first_block, last_block):
         bx, by, bz = unpack_block(block_keys[block])
         for k in range(27):
@@ -155,8 +157,6 @@ def fit_surfels(
                     there = ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7)
                     found = block_cells[other, there]
                     neighbour_cell[k] = found
-                    neighbour_block[k] = other
-                    neighbour_local[k] = there
                     if found >= 0:
                         occupied += 1
                         add_moved(
@@ -167,20 +167,22 @@ def fit_surfels(
             cx, cy, cz = ((bx << 3) + lx + 0.5) * cell, ((by << 3) + ly + 0.5) * cell, ((bz << 3) + lz + 0.5) * cell
 
             # A thin plate scanned from both sides: its views disagree about the side.
-            front = back = toward = 0.0
-            for slot in range(slot_starts[block], slot_starts[block + 1]):
-                row = slot_cells[slots[slot], local]
-                if row >= 0:
-                    along = moments[row, 10] * nx + moments[row, 11] * ny + moments[row, 12] * nz
-                    toward += along
-                    if along > 0.0:
-                        front += moments[row, 0]
-                    elif along < 0.0:
-                        back += moments[row, 0]
+            front = back = dx = dy = dz = np.int64(0)
+            row = np.int64(cell_rows[c])
+            while row >= 0:
+                along = moments[row, 10] * nx + moments[row, 11] * ny + moments[row, 12] * nz
+                if along > 0.0:
+                    front += moments[row, 0]
+                elif along < 0.0:
+                    back += moments[row, 0]
+                dx += moments[row, 10]
+                dy += moments[row, 11]
+                dz += moments[row, 12]
+                row = np.int64(links[row, 1])
             two = occupied >= min_neighbours and min(front, back) >= max(2.0, 0.1 * totals[c, 0])
             n_sides[c] = 2 if two else 1
             if not two:
-                sign = -1.0 if toward < 0.0 else 1.0
+                sign = -1.0 if dx * nx + dy * ny + dz * nz < 0.0 else 1.0
                 if occupied < min_neighbours:
                     sign = 0.0
                 n = totals[c, 0]
@@ -194,32 +196,33 @@ def fit_surfels(
                 side[:] = 0.0
                 pool[:] = 0.0
                 occupied = 0
-                toward_x = toward_y = toward_z = 0.0
+                dx = dy = dz = np.int64(0)
                 for k in range(27):
                     if neighbour_cell[k] < 0:
                         continue
-                    there, other = neighbour_local[k], neighbour_block[k]
-                    seen = False
-                    for slot in range(slot_starts[other], slot_starts[other + 1]):
-                        row = slot_cells[slots[slot], there]
-                        if row >= 0:
-                            along = moments[row, 10] * nx + moments[row, 11] * ny + moments[row, 12] * nz
-                            if along * sign > 0.0:
-                                seen = True
-                                toward_x += moments[row, 10]
-                                toward_y += moments[row, 11]
-                                toward_z += moments[row, 12]
-                                add_moved(
-                                    pool, moments, row, (k // 9 - 1) * units,
-                                    (k // 3 % 3 - 1) * units, (k % 3 - 1) * units,
-                                )  # fmt: skip
-                                if k == 13:
-                                    add_moved(side, moments, row, 0.0, 0.0, 0.0)
-                    occupied += 1 if seen else 0
+                    views[:, :] = 0
+                    row = np.int64(cell_rows[neighbour_cell[k]])
+                    while row >= 0:
+                        along = moments[row, 10] * nx + moments[row, 11] * ny + moments[row, 12] * nz
+                        if along * sign > 0.0:
+                            for j in range(13):
+                                views[0, j] += moments[row, j]
+                        row = np.int64(links[row, 1])
+                    if views[0, 0] == 0:
+                        continue
+                    occupied += 1
+                    dx += views[0, 10]
+                    dy += views[0, 11]
+                    dz += views[0, 12]
+                    add_moved(
+                        pool, views, 0, (k // 9 - 1) * units, (k // 3 % 3 - 1) * units, (k % 3 - 1) * units
+                    )  # fmt: skip
+                    if k == 13:
+                        add_moved(side, views, 0, 0.0, 0.0, 0.0)
                 mx, my, mz, low = nx, ny, nz, 0.0
                 if occupied >= min_neighbours:
                     mx, my, mz, low, _, _ = plane_of(pool)
-                flip = -1.0 if toward_x * mx + toward_y * my + toward_z * mz < 0.0 else 1.0
+                flip = -1.0 if dx * mx + dy * my + dz * mz < 0.0 else 1.0
                 n, spread = side[0], sqrt(max(low, 0.0)) * unit
                 x, y, z = cx + side[1] / n * unit, cy + side[2] / n * unit, cz + side[3] / n * unit
                 if s == 0:
@@ -227,6 +230,9 @@ def fit_surfels(
                     normals[c, 0], normals[c, 1], normals[c, 2] = flip * mx, flip * my, flip * mz
                     flatness[c], points[c] = spread, n
                 else:
-                    backs[c, 0], backs[c, 1], backs[c, 2] = x, y, z
-                    backs[c, 3], backs[c, 4], backs[c, 5] = flip * mx, flip * my, flip * mz
-                    backs[c, 6], backs[c, 7] = spread, n
+                    b = back_count
+                    backs[b, 0], backs[b, 1], backs[b, 2] = x, y, z
+                    backs[b, 3], backs[b, 4], backs[b, 5] = flip * mx, flip * my, flip * mz
+                    backs[b, 6], backs[b, 7] = spread, n
+                    back_count += 1
+    return backs[:back_count].copy()
