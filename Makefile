@@ -1,6 +1,6 @@
 # make demo   install, find a pump skid in a real scan of a plant room, say where the results lie
 # make test   install, lint, check types and imports, run all tests
-# make fast   the tests that take seconds, in an environment that `make test` made
+# make fast   formats, poses, features, rules and results: half a minute, in an environment that `make test` made
 # make clean-kernels   after a change in a kernel that other kernels call: their caches do not notice it
 
 PYTHON ?= python3.11
@@ -11,6 +11,10 @@ SOURCES := $(shell find src -name '*.py')
 # An index out of bounds corrupts silently in compiled code: these run once with every access checked.
 KERNEL_TESTS := $(wildcard $(foreach stage,near_surface isolate surface pairs surfels search verify refine scene,\
 	tests/test_$(stage)*.py))
+
+# What neither starts a child process for each model nor compiles the search.
+QUICK_TESTS := $(foreach name,pose pairs config results imports deviation verify scans_ply scans_pcd scans_las scans_e57,\
+	tests/test_$(name).py)
 
 .PHONY: demo test fast lint clean clean-kernels
 
@@ -23,7 +27,7 @@ test: lint
 	$(BIN)/pytest -m "slow or not slow"
 
 fast: $(VENV)/developed
-	$(BIN)/pytest
+	$(BIN)/pytest -q $(QUICK_TESTS)
 
 lint: $(VENV)/developed
 	$(BIN)/ruff check
