@@ -17,6 +17,7 @@ from scanfind.find import with_points
 from scanfind.library import ModelLibrary
 from scanfind.results import MODELS, fill_folder, open_remainder, read_results, result_folder
 from scanfind.sources import Sources
+from scanfind.threads import available_cores
 
 if TYPE_CHECKING:
     from scanfind.progress import Progress
@@ -57,7 +58,7 @@ def isolate_again(
             tell = progress or (lambda stage, done, total: None)
             say_if_compiling(tell)
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
-            findings = Findings(with_points(found, models.models(), chunks, within, rest))
+            findings = Findings(with_points(found, models.models(), chunks, within, rest, available_cores()))
         findings.refused, findings.notes = found.refused, found.notes
         findings.shift, findings.crs, findings.tolerance_m = found.shift, found.crs, within
         # Where the scanner stood may have been told to the search by hand.

@@ -17,7 +17,6 @@ from scanfind.deviation import deviation_of
 from scanfind.errors import UsageError, require
 from scanfind.isolate import IsolateParameters, Placed
 from scanfind.isolate import isolate as isolate_raw
-from scanfind.kernels import use_threads
 from scanfind.library import ModelLibrary, joint_table
 from scanfind.mesh import Mesh
 from scanfind.model import Model, ModelParameters
@@ -103,12 +102,11 @@ def find(
     findings.extend(found.detections())
     findings.refused = found.refused()
     if isolate and (findings or remainder is not None):
-        use_threads(jobs)
         with clock("isolate"):  # 3.5 isolation: the second pass
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
             tolerance = isolation_tolerance(parameters.isolate, found.noise(), scene.fine.cell)
             findings.tolerance_m = tolerance
-            findings[:] = with_points(findings, library, chunks, tolerance, remainder)
+            findings[:] = with_points(findings, library, chunks, tolerance, remainder, jobs)
     findings.scans = [source.told() for source in sources.all]
     findings.crs, findings.notes = sources.crs(), found.notes()
     findings.shift = tuple(shift_for(scene.fine.offset).tolist())
@@ -166,7 +164,7 @@ def isolation_tolerance(parameters: IsolationParameters, noise: float, cell: flo
 
 def with_points(
     findings: Sequence[Detection], library: Sequence[Model], chunks: Iterable[PointChunk], tolerance: float,
-    remainder: CloudWriter | None,
+    remainder: CloudWriter | None, jobs: int,
 ) -> list[Detection]:  # fmt: skip
     """Each detection with its raw points and how far they are from its model."""
     surfaces = {
@@ -176,7 +174,7 @@ def with_points(
     }
     placed = [Placed(found.id, surfaces[found.model], found.scene_from_model) for found in findings]
     rest = None if remainder is None else lambda chunk: write_rest(remainder, chunk)
-    points = isolate_raw(chunks, placed, IsolateParameters(tolerance), remainder=rest)
+    points = isolate_raw(chunks, placed, IsolateParameters(tolerance), remainder=rest, jobs=jobs)
     return [
         found.with_points(cut := points[found.id], deviation_of(cut.deviation) if len(cut) else None)
         for found in findings

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scanfind.cloud import PointChunk
 from scanfind.detection import IsolatedPoints
 from scanfind.errors import InvalidGeometryError, UsageError
+from scanfind.threads import in_threads
 
 if TYPE_CHECKING:
     from scanfind.kernels.distance import NearSurface, Vicinity
@@ -67,11 +69,14 @@ class Isolator:
     """Says of each raw point whose it is: the nearest placed surface within tolerance has it, and no other.
 
     shift : (3,) what is taken off the file's coordinates before a pose of `placed` holds, metres
+    jobs : threads, on which the result does not depend
 
     Raises UsageError for ids that are below 1 or used twice, or a reach below the tolerance.
     """
 
-    def __init__(self, placed: Sequence[Placed], parameters: IsolateParameters, shift: ArrayLike = (0, 0, 0)) -> None:
+    def __init__(
+        self, placed: Sequence[Placed], parameters: IsolateParameters, shift: ArrayLike = (0, 0, 0), jobs: int = 1
+    ) -> None:
         ids = [p.id for p in placed]
         if len(set(ids)) < len(ids) or min(ids, default=1) < 1:
             msg = f"placed models need different ids from 1 on, got {sorted(ids)}"
@@ -81,7 +86,7 @@ class Isolator:
             raise UsageError(msg)
         # Lowest id first: the first of two equal distances is kept.
         self.placed = sorted(placed, key=lambda p: p.id)
-        self.tolerance = np.float32(parameters.tolerance)
+        self.tolerance, self.jobs = np.float32(parameters.tolerance), jobs
         self.shift = np.array(shift, dtype=np.float64)
         if self.shift.shape != (3,):
             msg = f"the shift of a scene must have shape (3,), got {self.shift.shape}"
@@ -93,16 +98,18 @@ class Isolator:
 
         Distances are in metres, + outside.
         """
-        from scanfind.kernels.distance import blocks_of, distances
+        from scanfind.kernels.distance import blocks_of
 
         owner = np.zeros(len(chunk), dtype=np.int32)
         deviation = np.full(len(chunk), np.nan, dtype=np.float32)
         xyz = np.ascontiguousarray(chunk.xyz, dtype=np.float64)
-        block = blocks_of(self._vicinity, self.shift, xyz)
+        if not len(xyz):
+            return owner, deviation
+        parts = in_threads(self.jobs, len(xyz), lambda i, j: blocks_of(self._vicinity, self.shift, xyz[i:j]))
+        block = np.concatenate(parts)
         rows = np.flatnonzero(block >= 0)
         for placed, mine in self._candidates(rows, block[rows]):
-            pose = placed.scene_from_model
-            distance, _ = distances(placed.near, pose.rotation, pose.translation, self.shift, xyz, mine)
+            distance = np.concatenate(in_threads(self.jobs, len(mine), partial(self._measure, placed, xyz, mine)))
             so_far = np.where(owner[mine] > 0, np.abs(deviation[mine]), np.float32(np.inf))
             nearer = (np.abs(distance) <= self.tolerance) & (np.abs(distance) < so_far)
             owner[mine[nearer]] = placed.id
@@ -115,6 +122,14 @@ class Isolator:
         For a writer that follows the stream; `isolate` gathers the same pieces.
         """
         return pieces_of(chunk, *self.cut(chunk))
+
+    def _measure(self, placed: Placed, xyz: Floats, mine: NDArray[np.int64], i: int, j: int) -> NDArray[np.float32]:
+        """How far the points xyz[mine[i:j]] are from a placed surface, NaN beyond its reach."""
+        from scanfind.kernels.distance import distances
+
+        pose = placed.scene_from_model
+        distance, _ = distances(placed.near, pose.rotation, pose.translation, self.shift, xyz, mine[i:j])
+        return np.asarray(distance)
 
     def _candidates(
         self, rows: NDArray[np.int64], block: NDArray[np.int32]
@@ -138,6 +153,7 @@ def isolate(
     parameters: IsolateParameters,
     shift: ArrayLike = (0, 0, 0),
     remainder: Callable[[PointChunk], None] | None = None,
+    jobs: int = 1,
 ) -> dict[int, IsolatedPoints]:
     """The raw points of every placed model, by detection id, in the order of the stream; empty where there is none.
 
@@ -145,10 +161,12 @@ def isolate(
     shift : (3,) taken off the file's coordinates before the poses hold, metres
     remainder : receives what is left of each chunk, one for one and possibly empty: the scene without the found objects
 
+    jobs : threads, on which the result does not depend
+
     Every detection has every attribute of the scene; where a chunk lacks one, it is NaN (floats) or 0.
     Raises as `Isolator` does.
     """
-    isolator = Isolator(placed, parameters, shift)
+    isolator = Isolator(placed, parameters, shift, jobs)
     pieces: dict[int, list[IsolatedPoints]] = {p.id: [] for p in isolator.placed}
     fields: dict[str, np.dtype[Any]] = {}
     for chunk in chunks:

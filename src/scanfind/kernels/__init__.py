@@ -8,13 +8,6 @@ from typing import Any
 COMPILE_S = 20.0  # roughly, on two cores, for the kernels of one search
 
 
-def use_threads(jobs: int) -> None:
-    """Let the parallel kernels, those of isolation, use so many threads, and no more than the machine offers."""
-    import numba
-
-    numba.set_num_threads(max(1, min(jobs, numba.config.NUMBA_NUM_THREADS)))
-
-
 def compiled(*kernels: Any) -> bool:
     """Have kernels been compiled on this machine before, so that they only need loading?"""
     return all(_is_cached(kernel) for kernel in kernels)

@@ -11,7 +11,7 @@ from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 LEAF = 4  # primitives a leaf at most
@@ -312,14 +312,14 @@ def measure(near, rotation, translation, shift, xyz, rows, distance, face):
                 face[i] = near.face[row]
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def distances(near, rotation, translation, shift, xyz, rows):
     """Signed distances (K,) float32 of the points xyz[rows], NaN beyond reach, and the nearest faces (K,), -1 there.
 
     rotation, translation : (3, 3), (3,) scene_from_model, where the scene is xyz - shift
     """
     distance, face = np.empty(len(rows), np.float32), np.empty(len(rows), np.int32)
-    for tile in prange((len(rows) + TILE - 1) // TILE):
+    for tile in range((len(rows) + TILE - 1) // TILE):
         part = slice(tile * TILE, (tile + 1) * TILE)
         measure(near, rotation, translation, shift, xyz, rows[part], distance[part], face[part])
     return distance, face
@@ -352,18 +352,18 @@ def mark_cells(near, rotation, translation, corner, cell, allowed, bits):
             m += size * size * size
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def cells_near(near, rotation, translation, low, cell, blocks, tolerance):
     """The cells within `tolerance` of a placed surface as bits (B, 8) of the blocks with coordinates (B, 3)."""
     bits = np.zeros((len(blocks), 8), np.uint64)
     allowed = sqrt(tolerance**2 + near.spacing**2)
-    for b in prange(len(blocks)):
+    for b in range(len(blocks)):
         corner = low + 8.0 * cell * blocks[b]
         mark_cells(near, rotation, translation, corner, cell, allowed, bits[b])
     return bits
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def blocks_of(vicinity, shift, xyz):
     """The block of each of N points whose cell is near a placed surface, (N,) int32; -1 for the many that are not."""
     n = len(xyz)
@@ -371,7 +371,7 @@ def blocks_of(vicinity, shift, xyz):
     top, bits = vicinity.top, vicinity.bits
     per_cell = 1.0 / vicinity.cell
     size_x, size_y, size_z = 8.0 * top.shape[0], 8.0 * top.shape[1], 8.0 * top.shape[2]
-    for i in prange(n):
+    for i in range(n):
         found = -1
         x = ((xyz[i, 0] - shift[0]) - vicinity.low[0]) * per_cell
         y = ((xyz[i, 1] - shift[1]) - vicinity.low[1]) * per_cell
