@@ -109,6 +109,8 @@ class Isolator:
         block = np.concatenate(parts)
         rows = np.flatnonzero(block >= 0)
         for placed, mine in self._candidates(rows, block[rows]):
+            if not len(mine):
+                continue
             distance = np.concatenate(in_threads(self.jobs, len(mine), partial(self._measure, placed, xyz, mine)))
             so_far = np.where(owner[mine] > 0, np.abs(deviation[mine]), np.float32(np.inf))
             nearer = (np.abs(distance) <= self.tolerance) & (np.abs(distance) < so_far)
