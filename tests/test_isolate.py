@@ -6,7 +6,6 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 import trimesh
@@ -156,14 +155,7 @@ def test_a_writer_may_follow_the_stream(crowd: tuple[list[Placed], PointChunk]) 
 
 def test_threads_do_not_matter(crowd: tuple[list[Placed], PointChunk]) -> None:
     placed, chunk = crowd
-    before = numba.get_num_threads()
-    results = []
-    try:
-        for threads in (1, 2, 4):
-            numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-            results.append(isolate([chunk], placed, PARAMETERS))
-    finally:
-        numba.set_num_threads(before)
+    results = [isolate([chunk], placed, PARAMETERS, jobs=jobs) for jobs in (1, 2, 4)]
     assert_same(results[0], results[1])
     assert_same(results[0], results[2])
 

@@ -25,7 +25,6 @@ MOST_HOLES, LEAST_DEPTH_PIXELS = 0.15, 45
 # on, doubling took 0.9 s of a pass over 10 M points that needs 0.8 s.
 EMPTY_BLOCKS, EMPTY_ROWS = 1 << 16, 1 << 22
 POINTS_TO_SETTLE = 1000  # of which the median says where the scan lies
-ROWS_AT_ONCE = 64 * 54  # what one block may ask for (kernels.grid.sum_children)
 
 
 @dataclass(frozen=True)
@@ -188,6 +187,7 @@ class MomentGrid:
     def _make_room(self) -> None:
         """Double whichever array is full; copied is only what is in use."""
         from scanfind.kernels.blocks import fill_hash
+        from scanfind.kernels.grid import ROWS_OF_OCTANT
 
         if self._counts[0] + 1 > len(self._block_keys):
             self._block_keys = doubled(self._block_keys)
@@ -195,7 +195,7 @@ class MomentGrid:
             self._hash_keys = np.full(4 * len(self._block_keys), -1, np.int64)
             self._hash_values = np.zeros(len(self._hash_keys), np.int32)
             fill_hash(self._block_keys[: self._counts[0]], self._hash_keys, self._hash_values)
-        if self._counts[1] + ROWS_AT_ONCE > len(self._moments):
+        if self._counts[1] + ROWS_OF_OCTANT > len(self._moments):
             self._moments, self._links = doubled(self._moments), doubled(self._links)
 
     def points_per_row(self) -> float:
