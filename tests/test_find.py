@@ -22,6 +22,7 @@ from scanfind.model import ModelParameters
 from scanfind.pairs import PairParameters
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.pose import Pose, random_rotation
+from scanfind.scene import GridParameters
 from scanfind.simulate.furniture import hall
 from scanfind.simulate.objects import pipe_spool
 from scanfind.simulate.parts import blocks, box, cylinder
@@ -29,7 +30,6 @@ from scanfind.simulate.scanner import Scanner, SimulatedScan, scan
 from scanfind.simulate.scene import Scene, SceneObject
 from scanfind.simulate.scenes import shop
 from scanfind.surface import SurfaceParameters
-from scanfind.surfels import GridParameters
 
 Floats = NDArray[np.float64]
 

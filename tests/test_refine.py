@@ -16,13 +16,14 @@ from scanfind.detection import Motion
 from scanfind.kernels.nearest import nearest_surfel
 from scanfind.mesh import Mesh
 from scanfind.model import Model, ModelParameters, build_model
+from scanfind.moments import MomentGrid
 from scanfind.pose import Pose, random_rotation
 from scanfind.refine import Refined, icp, shrinking, unobservable
 from scanfind.search import Hypotheses, ModelArrays, model_arrays
 from scanfind.simulate.parts import blocks, pipe
 from scanfind.simulate.placement import surface_points
 from scanfind.surface import SurfaceParameters
-from scanfind.surfels import MomentGrid, Surfels
+from scanfind.surfels import Surfels
 from scanfind.symmetry import self_similar
 
 Floats = NDArray[np.float64]
@@ -45,7 +46,7 @@ def seen(mesh: Mesh, pose: Pose, per_m2: float = 60_000.0, seed: int = 0) -> Sur
     points = pose.move(surface_points(mesh, np.random.default_rng(seed), per_m2))
     grid = MomentGrid(CELL, np.zeros(3))
     grid.add(PointChunk(points, {}, np.arange(len(points))))
-    return grid.surfels()
+    return Surfels(grid).fit()
 
 
 def refined(model: Model, surfels: Surfels, start: list[Pose], jobs: int = 1) -> tuple[Refined, ModelArrays]:
@@ -171,14 +172,15 @@ def test_nothing_is_open_on_an_irregular_body() -> None:
 def test_the_nearest_surfel_is_brute_force_s(seed: int, gate_cells: float, cosine: float, signed: bool) -> None:
     rng = np.random.default_rng(seed)
     surfels = scattered()
+    cells = surfels.cells
     gate = gate_cells * surfels.cell
     for _ in range(30):
         near = surfels.means[rng.integers(len(surfels.means))]
         point = near + rng.normal(scale=0.5 * surfels.cell, size=3)
         normal = random_rotation(rng)[0]
         found = nearest_surfel(
-            *point, *normal, gate, cosine, signed, surfels.cell, surfels.hash_keys, surfels.hash_values,
-            surfels.block_cells, surfels.first_surfel, surfels.means, surfels.normals,
+            *point, *normal, gate, cosine, signed, surfels.cell, cells.hash_keys, cells.hash_values,
+            cells.block_rows, surfels.first_surfel, surfels.sides, surfels.means, surfels.normals,
         )  # fmt: skip
         assert found == naive.nearest(point, normal, surfels.means, surfels.normals, gate, cosine, signed)
 
@@ -189,7 +191,7 @@ def scattered() -> Surfels:
     grid = MomentGrid(0.1, np.zeros(3))
     grid.add(PointChunk(points, {}, np.arange(3000), origin=np.full(3, 4.0)))
     grid.add(PointChunk(points + 0.01, {}, np.arange(3000), origin=np.full(3, -4.0)))
-    return grid.surfels()
+    return Surfels(grid).fit()
 
 
 # ── self-similar poses ──

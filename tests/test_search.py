@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from scanfind.cloud import PointChunk
 from scanfind.kernels.blocks import find_block, pack_block
-from scanfind.kernels.search import draw_pairs, normal_bit
+from scanfind.kernels.search import draw_firsts, draw_seconds, normal_bit
+from scanfind.moments import MomentGrid
 from scanfind.scene import orientation_grid
 from scanfind.search import bin_pool, wald_table
-from scanfind.surfels import MomentGrid, Surfels
+from scanfind.surfels import Surfels
 from scanfind.symmetry import cube_turns
 from scanfind.threads import in_threads
 
@@ -32,7 +33,7 @@ def room(count: int = 30_000, cell: float = 0.05) -> Surfels:
     points[np.arange(count), rng.integers(0, 3, count)] = rng.choice([-1.0, 1.0], count)
     grid = MomentGrid(cell, np.zeros(3))
     grid.add(PointChunk(points, {}, np.arange(count), origin=np.full(3, 0.1)))
-    return grid.surfels()
+    return Surfels(grid).fit()
 
 
 @pytest.fixture(scope="module")
@@ -44,17 +45,16 @@ def draw(
     surfels: Surfels, pool: NDArray[np.intp], count: int, seed: int = 5, cuts: tuple[int, ...] = (), tries: int = 1000
 ) -> tuple[Ints, Ints]:
     """`count` pairs of the pool at DISTANCE ± TOLERANCE, drawn in pieces that end at the cuts."""
-    bins = bin_pool(pool, surfels.means, DISTANCE / 6)
-    ways = np.random.default_rng(0).standard_normal((1 << 12, 3))
-    ways /= np.linalg.norm(ways, axis=1)[:, None]
+    bins = bin_pool(pool, surfels.means, DISTANCE, TOLERANCE)
     first, second = np.full(count, -7, np.int64), np.full(count, -7, np.int64)
-    ends = [0, *sorted(cuts), count]
-    for start, stop in pairwise(ends):
-        draw_pairs(
-            start, stop, seed, 3, bins.pool, bins.edge, bins.hash_keys, bins.hash_values, bins.starts, surfels.means,
-            ways, DISTANCE, TOLERANCE, tries, first, second,
+    draw_firsts(seed, 3, len(pool), first)
+    order = np.argsort(bins.bin_of[first], kind="stable")
+    for start, stop in pairwise([0, *sorted(cuts), count]):
+        draw_seconds(
+            start, stop, order, first, seed, 3, bins.keys, bins.bin_of, bins.hash_keys, bins.hash_values, bins.starts,
+            bins.points, bins.shell, DISTANCE, TOLERANCE, tries, second,
         )  # fmt: skip
-    return first, second
+    return bins.pool[first], np.where(second >= 0, bins.pool[second], second)
 
 
 def test_pairs_are_of_the_pool_and_at_the_distance(surfels: Surfels) -> None:
@@ -102,7 +102,7 @@ def test_nothing_at_the_distance_is_said(surfels: Surfels) -> None:
 
 def test_the_pool_s_bins_hold_each_surfel_once(surfels: Surfels) -> None:
     pool = np.arange(0, len(surfels.means), 3)
-    bins = bin_pool(pool, surfels.means, 0.2)
+    bins = bin_pool(pool, surfels.means, 1.2, TOLERANCE)  # six bins of 0.2 m a distance
     np.testing.assert_array_equal(np.sort(bins.pool), pool)
     assert bins.starts[0] == 0
     assert bins.starts[-1] == len(pool)
@@ -110,6 +110,28 @@ def test_the_pool_s_bins_hold_each_surfel_once(surfels: Surfels) -> None:
     for place, at in enumerate(where.tolist()):
         number = find_block(bins.hash_keys, bins.hash_values, pack_block(*at))
         assert bins.starts[number] <= place < bins.starts[number + 1]
+        assert bins.bin_of[place] == number
+        assert bins.keys[number] == pack_block(*at)
+
+
+def test_seconds_are_drawn_evenly_among_all_at_the_distance(surfels: Surfels) -> None:
+    pool = np.arange(0, len(surfels.means), 4)
+    first, _ = draw(surfels, pool, 60_000)
+    one = np.bincount(first).argmax()
+    bins = bin_pool(pool, surfels.means, DISTANCE, TOLERANCE)
+    # Every partner there is comes up, and none more often than chance has it: five sigma of χ².
+    count, drawn = 40_000, np.full(40_000, np.flatnonzero(bins.pool == one)[0])
+    seconds = np.empty(count, np.int64)
+    draw_seconds(
+        0, count, np.arange(count), drawn, 9, 3, bins.keys, bins.bin_of, bins.hash_keys, bins.hash_values, bins.starts,
+        bins.points, bins.shell, DISTANCE, TOLERANCE, 1000, seconds,
+    )  # fmt: skip
+    apart = np.linalg.norm(bins.points - surfels.means[one], axis=1)
+    partners = np.flatnonzero(np.abs(apart - DISTANCE) <= TOLERANCE)
+    counts = np.bincount(seconds, minlength=len(bins.points))
+    assert counts.sum() == counts[partners].sum() == count
+    mean = count / len(partners)
+    assert ((counts[partners] - mean) ** 2).sum() / mean < len(partners) + 5 * np.sqrt(2 * len(partners))
 
 
 @pytest.mark.parametrize("jobs", [1, 2, 3, 16])
@@ -156,8 +178,9 @@ def test_wald_keeps_the_right_and_ends_the_wrong_early(right: float, wrong: floa
 
 
 @pytest.mark.parametrize("signed", [True, False])
-def test_a_surfel_marks_its_own_cell_and_those_along_its_normal(surfels: Surfels, signed: bool) -> None:
-    surfels = surfels._replace(signed=signed)
+def test_a_surfel_marks_its_own_cell_and_those_along_its_normal(signed: bool) -> None:
+    surfels = room()
+    surfels.signed = signed
     grid = orientation_grid(surfels, 0.1, 0.2)
     marked = 0
     for mean, normal in zip(surfels.means[::7], surfels.normals[::7], strict=True):

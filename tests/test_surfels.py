@@ -14,9 +14,10 @@ import naive
 from scanfind.cloud import PointChunk, PointCloud
 from scanfind.kernels.blocks import BIAS, fill_hash, find_block, pack_block, unpack_block
 from scanfind.kernels.surfels import smallest_eigenvector
-from scanfind.scene import Scene, build_scene
+from scanfind.moments import MomentGrid
+from scanfind.scene import GridParameters, Scene, build_scene
 from scanfind.sources import Sources
-from scanfind.surfels import GridParameters, MomentGrid, Surfels, empty_hash
+from scanfind.surfels import Surfels, empty_hash
 
 Floats = NDArray[np.float64]
 
@@ -46,9 +47,19 @@ def bumpy(count: int, seed: int = 0) -> Floats:
     return points
 
 
+def fitted(grid: MomentGrid, least: int = 5, jobs: int = 1) -> Surfels:
+    return Surfels(grid, least, jobs).fit()
+
+
 def assert_equal(one: Surfels, other: Surfels) -> None:
-    """To the last bit."""
-    for name, mine, theirs in zip(one._fields, one, other, strict=True):
+    """To the last bit; the grids' own rows and blocks may lie in any order."""
+    for name in ("means", "normals", "flatness", "points", "cell_of", "signed"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    np.testing.assert_array_equal(one.cells.block_keys[one.cells.order], other.cells.block_keys[other.cells.order])
+    for name in ("first_cell", "locals", "cell"):
+        np.testing.assert_array_equal(getattr(one.cells, name), getattr(other.cells, name), err_msg=name)
+    for name in ("first_surfel", "sides"):
+        mine, theirs = getattr(one, name)[one.cells.rows], getattr(other, name)[other.cells.rows]
         np.testing.assert_array_equal(mine, theirs, err_msg=name)
 
 
@@ -59,17 +70,17 @@ def assert_same_moments(one: MomentGrid, other: MomentGrid) -> None:
 
 def moments_of(grid: MomentGrid) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Address (block, cell, view) and moments of every row, by address."""
-    used = int(grid._counts[0])
-    cells = grid._block_cells[:used]
+    used = int(grid.counts[0])
+    cells = grid.block_rows[:used]
     block, local = np.nonzero(cells >= 0)
     row, found = cells[block, local], []
     while len(row):  # along each cell's chain of views
-        found.append(np.stack([grid._block_keys[:used][block], local, grid._links[row, 0], row], axis=1))
-        more = grid._links[row, 1] >= 0
-        block, local, row = block[more], local[more], grid._links[row, 1][more]
+        found.append(np.stack([grid.block_keys[:used][block], local, grid.links[row, 0], row], axis=1))
+        more = grid.links[row, 1] >= 0
+        block, local, row = block[more], local[more], grid.links[row, 1][more]
     every = np.concatenate(found)
     every = every[np.lexsort(every[:, :3].T[::-1])]
-    return every[:, :3], grid._moments[every[:, 3]]
+    return every[:, :3], grid.moments[every[:, 3]]
 
 
 # ── addresses ──
@@ -108,7 +119,7 @@ def test_chunks_and_order_change_nothing(cuts: list[int], seed: int) -> None:
     shuffled = np.random.default_rng(seed).permutation(points)
     pieces = grid_of([chunk(part) for part in np.split(shuffled, sorted(cuts))])
     assert_same_moments(whole, pieces)
-    assert_equal(whole.surfels(), pieces.surfels())
+    assert_equal(fitted(whole), fitted(pieces))
     for one, other in zip(whole.depth_maps(), pieces.depth_maps(), strict=True):
         np.testing.assert_array_equal(one.ranges, other.ranges)
 
@@ -117,8 +128,8 @@ def test_arrays_grow_without_a_trace() -> None:
     # Far more blocks and cells than there is room for at first, in one chunk and in many.
     points = np.random.default_rng(0).uniform(-12, 12, (100_000, 3))
     whole = grid_of([chunk(points)], 0.1)
-    assert int(whole._counts[0]) > 2048
-    assert_equal(whole.surfels(), grid_of([chunk(p) for p in np.array_split(points, 7)], 0.1).surfels())
+    assert int(whole.counts[0]) > 2048
+    assert_equal(fitted(whole), fitted(grid_of([chunk(p) for p in np.array_split(points, 7)], 0.1)))
 
 
 @settings(deadline=None, max_examples=20)
@@ -135,7 +146,7 @@ def test_a_coarser_level_is_the_grid_of_larger_cells(seed: int, levels: int) -> 
     # A unit is a share of the finest cell; the sums count in it, of degree 0, 1 and 2.
     degree = np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2, 0, 0, 0])
     np.testing.assert_array_equal(sums, expected * 2 ** (levels * degree))
-    mine, theirs = coarse.surfels(), direct.surfels()
+    mine, theirs = fitted(coarse), fitted(direct)
     np.testing.assert_allclose(mine.means, theirs.means, rtol=0, atol=1e-12)
     np.testing.assert_allclose(mine.flatness, theirs.flatness, rtol=0, atol=1e-9)
 
@@ -147,8 +158,8 @@ def test_every_point_is_counted_once_or_said_to_be_too_far() -> None:
     assert grid.points == 3000
     assert grid.unaddressable == 7
     assert moments_of(grid)[1][:, 0].sum() == 2993
-    assert grid.coarser().surfels().points.sum() == 2993
-    assert grid.surfels().points.sum() == 2993
+    assert fitted(grid.coarser()).points.sum() == 2993
+    assert fitted(grid).points.sum() == 2993
 
 
 def test_the_reach_is_half_a_million_blocks() -> None:
@@ -156,7 +167,7 @@ def test_the_reach_is_half_a_million_blocks() -> None:
     points = np.array([[edge - 1.0, 0, 0], [1.0 - edge, 0, 0], [edge + 1.0, 0, 0], [0, 0, -edge - 1.0]])
     grid = grid_of([chunk(points)])
     assert grid.unaddressable == 2
-    np.testing.assert_allclose(np.sort(grid.surfels().means[:, 0]), [1.0 - edge, edge - 1.0], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(np.sort(fitted(grid).means[:, 0]), [1.0 - edge, edge - 1.0], rtol=0, atol=1e-6)
 
 
 def test_what_is_no_number_never_gets_in() -> None:
@@ -179,9 +190,9 @@ def test_a_scan_far_away_gives_the_same_surfels(far: tuple[int, int, int]) -> No
     here, there = MomentGrid(CELL), MomentGrid(CELL)
     here.add(chunk(points))
     there.add(chunk(points + shift, ORIGIN + shift))
-    one, other = here.surfels(), there.surfels()
-    np.testing.assert_array_equal(other.offset - one.offset, shift)
-    assert_equal(one, other._replace(offset=one.offset))
+    one, other = fitted(here), fitted(there)
+    np.testing.assert_array_equal(other.cells.offset - one.cells.offset, shift)
+    assert_equal(one, other)
     np.testing.assert_array_equal(here.depth_maps()[0].ranges, there.depth_maps()[0].ranges)
 
 
@@ -191,16 +202,33 @@ def test_a_scan_far_away_gives_the_same_surfels(far: tuple[int, int, int]) -> No
 @pytest.mark.parametrize("jobs", [2, 3, 8])
 def test_threads_change_nothing(jobs: int) -> None:
     grid = grid_of([chunk(bumpy(20_000))])
-    assert_equal(grid.surfels(jobs=1), grid.surfels(jobs=jobs))
+    assert_equal(fitted(grid), fitted(grid, jobs=jobs))
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**32), st.integers(1, 6))
+def test_cells_fitted_in_turn_are_those_fitted_at_once(seed: int, turns: int) -> None:
+    grid, rng = grid_of([chunk(bumpy(5000)), chunk(bumpy(2000, 1), ORIGIN + 4.0)]), np.random.default_rng(seed)
+    whole, pieces = fitted(grid), Surfels(grid)
+    for _ in range(turns):
+        some = rng.integers(0, len(whole.cells), 300)
+        of_all, of_some = whole.of(some), pieces.of(some)
+        for name in ("means", "normals", "flatness", "points", "cell_of"):
+            np.testing.assert_array_equal(getattr(whole, name)[of_all], getattr(pieces, name)[of_some], err_msg=name)
+    assert len(np.unique(pieces.cell_of)) <= 300 * turns  # and no other
+    pieces.fit()
+    assert len(pieces) == len(whole)
+    every = np.arange(len(whole.cells))
+    np.testing.assert_array_equal(pieces.means[pieces.of(every)], whole.means[whole.of(every)])
 
 
 @pytest.mark.parametrize("least", [1, 5, 12])
 def test_means_and_normals_are_those_of_plain_pca(least: int) -> None:
     points = bumpy(4000, 3)
-    found = grid_of([chunk(points)]).surfels(least)
+    found = fitted(grid_of([chunk(points)]), least)
     expected = naive.surfels(points, np.broadcast_to(ORIGIN, points.shape), CELL, least)
     assert len(found.means) == len(expected)
-    assert (np.diff(found.first_surfel) == 1).all()  # a single scanner sees one side of everything
+    assert (found.sides[found.cells.rows] == 1).all()  # a single scanner sees one side of everything
     compared = 0
     for mean, normal in zip(found.means, found.normals, strict=True):
         mean_expected, normal_expected, sure = expected[tuple(np.floor(mean / CELL).astype(int).tolist())]
@@ -218,7 +246,7 @@ def test_means_and_normals_are_those_of_plain_pca(least: int) -> None:
 def test_a_cell_with_few_neighbours_has_presence_and_no_normal() -> None:
     rng = np.random.default_rng(0)
     lonely = np.array([5.01, 5.01, 5.01]) + rng.uniform(0, 0.02, (50, 3))
-    found = grid_of([chunk(np.concatenate([bumpy(5000), lonely]))]).surfels(5)
+    found = fitted(grid_of([chunk(np.concatenate([bumpy(5000), lonely]))]))
     there = np.abs(found.means - 5.02).max(axis=1) < 0.05
     assert np.count_nonzero(there) == 1
     assert not found.normals[there].any()
@@ -237,7 +265,7 @@ def test_normals_point_to_the_scanner(inside: bool) -> None:
     points, at = sphere(60_000, 0.001), np.zeros(3) if inside else np.array([8.0, 3.0, 2.0])
     if not inside:
         points = points[points @ at > 1.3]  # what a scanner out there sees of it
-    found = grid_of([chunk(points, at)]).surfels()
+    found = fitted(grid_of([chunk(points, at)]))
     sound = found.has_normal()
     radial = found.means[sound] / np.linalg.norm(found.means[sound], axis=1)[:, None]
     facing = (found.normals[sound] * radial).sum(axis=1) * (-1.0 if inside else 1.0)
@@ -248,10 +276,10 @@ def test_normals_point_to_the_scanner(inside: bool) -> None:
 
 def test_without_a_scanner_normals_have_no_side() -> None:
     points = bumpy(3000)
-    assert grid_of([chunk(points)]).surfels().signed
-    assert not grid_of([chunk(points, None)]).surfels().signed
+    assert fitted(grid_of([chunk(points)])).signed
+    assert not fitted(grid_of([chunk(points, None)])).signed
     mixed = grid_of([chunk(points), chunk(points, None)])
-    assert not mixed.surfels().signed
+    assert not fitted(mixed).signed
     assert len(mixed.depth_maps()) == 1
 
 
@@ -275,7 +303,7 @@ def test_a_thin_plate_seen_from_both_sides_has_two_faces(tilt: float) -> None:
     middle = 0.5 * CELL * np.array([0.0, 0.0, 1.0])
     front, back = (face + middle for face in plate(40_000, 0.01, turn))
     parts = [chunk(front, 4.0 * up + 0.3), chunk(back, -4.0 * up + 0.3)]
-    found = grid_of(parts).surfels()
+    found = fitted(grid_of(parts))
     inner = found.has_normal() & (np.abs((found.means - middle) @ turn[:, :2]).max(axis=1) < 0.4)
     inner &= found.points >= 20  # the mean of so many is right within a fifth of their noise
     height, facing = (found.means[inner] - middle) @ up, found.normals[inner] @ up
@@ -283,7 +311,7 @@ def test_a_thin_plate_seen_from_both_sides_has_two_faces(tilt: float) -> None:
     np.testing.assert_allclose(height, np.sign(facing) * 0.005, rtol=0, atol=0.001)
     assert np.count_nonzero(facing > 0) == pytest.approx(np.count_nonzero(facing < 0), rel=0.1)
     if tilt == 0.0:
-        cells = np.diff(found.first_surfel)
+        cells = found.sides[found.cells.rows]
         assert (cells == 2).mean() > 0.8
 
 
@@ -291,7 +319,7 @@ def test_a_slanted_thin_plate_between_two_near_scanners_has_two_faces() -> None:
     across = np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0)
     turn = np.stack([np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0), np.array([0.0, 0.0, 1.0]), across], axis=1)
     front, back = plate(40_000, 0.01, turn)
-    found = grid_of([chunk(front, np.array([5.0, 1.0, 1.0])), chunk(back, np.array([1.0, 5.0, 1.0]))]).surfels()
+    found = fitted(grid_of([chunk(front, np.array([5.0, 1.0, 1.0])), chunk(back, np.array([1.0, 5.0, 1.0]))]))
     inner = found.has_normal() & (np.abs(found.means @ turn[:, :2]).max(axis=1) < 0.4)
     np.testing.assert_allclose(np.abs(found.means[inner] @ across), 0.005, rtol=0, atol=0.001)
 
@@ -319,7 +347,7 @@ def test_smallest_eigenvector_is_eigh_s(seed: int, values: tuple[float, float, f
 def test_flatness_is_the_noise_across_a_plane() -> None:
     rng = np.random.default_rng(6)
     points = np.column_stack([rng.uniform(-1, 1, (200_000, 2)), 0.02 + rng.normal(scale=0.003, size=200_000)])
-    found = grid_of([chunk(points)]).surfels()
+    found = fitted(grid_of([chunk(points)]))
     assert np.median(found.flatness) == pytest.approx(0.003, rel=0.02)
 
 

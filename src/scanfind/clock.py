@@ -69,7 +69,7 @@ def say_if_compiling(tell: Progress) -> None:
     from scanfind.kernels import COMPILE_S, compiled
     from scanfind.kernels.distance import distances
     from scanfind.kernels.search import test_pairs
-    from scanfind.kernels.surfels import fit_surfels
+    from scanfind.kernels.surfels import fit_cells
 
-    if not compiled(distances, test_pairs, fit_surfels):
+    if not compiled(distances, test_pairs, fit_cells):
         tell("compile", 0.0, COMPILE_S)

@@ -6,8 +6,9 @@ import numpy as np
 
 from scanfind.cloud import CloudModel, OrientedCloud, PointChunk
 from scanfind.errors import InvalidGeometryError
+from scanfind.moments import MomentGrid
 from scanfind.surface import MAX_LEVELS, SHRINK, ModelSurface, SurfaceParameters, surface_of
-from scanfind.surfels import MomentGrid, Surfels
+from scanfind.surfels import Surfels
 
 # A piece of scan is resampled as finely as its points allow, between these shares of its size.
 FINEST, COARSEST = 1.0 / 250.0, 1.0 / 30.0
@@ -29,7 +30,7 @@ def resample(cloud: CloudModel) -> Surfels:
     grid.add(PointChunk(cloud.points, {}, np.arange(len(cloud.points)), 0, origin))
     while grid.points_per_row() < POINTS_A_CELL and 2.0 * grid.cell <= size * COARSEST:
         grid = grid.coarser()
-    return grid.surfels(MIN_NEIGHBOURS)
+    return Surfels(grid, MIN_NEIGHBOURS).fit()
 
 
 def oriented(cloud: CloudModel) -> tuple[OrientedCloud, float]:
@@ -39,7 +40,7 @@ def oriented(cloud: CloudModel) -> tuple[OrientedCloud, float]:
     if np.count_nonzero(sound) < 2:
         msg = f"model {cloud.name!r} is too sparse for normals ({len(cloud.points)} points); cut a denser piece"
         raise InvalidGeometryError(msg)
-    points = surfels.means[sound] + surfels.offset
+    points = surfels.means[sound] + surfels.cells.offset
     return OrientedCloud(points, np.ascontiguousarray(surfels.normals[sound]), surfels.signed), surfels.cell
 
 

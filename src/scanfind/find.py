@@ -20,12 +20,12 @@ from scanfind.isolate import isolate as isolate_raw
 from scanfind.library import ModelLibrary, joint_table
 from scanfind.mesh import Mesh
 from scanfind.model import Model, ModelParameters
+from scanfind.moments import MomentGrid
 from scanfind.near_surface import near_model
 from scanfind.parameters import PRESETS, IsolationParameters, Parameters
 from scanfind.recognise import Recognition
 from scanfind.scene import build_scene, first_cell
 from scanfind.sources import Scan, Sources, require_points
-from scanfind.surfels import MomentGrid
 from scanfind.threads import available_cores
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def find(
         table = joint_table(library)
 
     with clock("grid"):  # 3.1, 3.3 scene representation: the weighted octree, in one pass
-        grid = MomentGrid(first_cell([model.diameter for model in library], parameters.grid))
+        grid = MomentGrid(first_cell([model.diameter for model in library], parameters.grid), jobs=jobs)
         for chunk in watched(sources.chunks(), clock, tell, "read", sources.expected()):
             grid.add(chunk)
         require_points(sources)
@@ -109,7 +109,7 @@ def find(
             findings[:] = with_points(findings, library, chunks, tolerance, remainder, jobs)
     findings.scans = [source.told() for source in sources.all]
     findings.crs, findings.notes = sources.crs(), found.notes()
-    findings.shift = tuple(shift_for(scene.fine.offset).tolist())
+    findings.shift = tuple(shift_for(scene.fine.cells.offset).tolist())
     findings.timings_s = clock.timings()
     return findings
 

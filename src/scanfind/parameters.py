@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from scanfind.errors import require
 from scanfind.pairs import PairParameters
 from scanfind.refine import RefineParameters
+from scanfind.scene import GridParameters
 from scanfind.search import SearchParameters
 from scanfind.surface import SurfaceParameters
-from scanfind.surfels import GridParameters
 from scanfind.verify import VerifyParameters
 
 

@@ -14,7 +14,7 @@ from scanfind.pose import Pose
 from scanfind.refine import Refined, icp, shrinking, unobservable
 from scanfind.search import AREA_OF_A_SAMPLE, Hypotheses, Search, model_arrays
 from scanfind.symmetry import self_similar
-from scanfind.verify import Evidence, distances, distinct, gather, outlines, score, why_refused
+from scanfind.verify import Evidence, distances, distinct, gather, outlines, rough_score, score, why_refused
 
 if TYPE_CHECKING:
     from scanfind.library import JointTable
@@ -30,6 +30,11 @@ CLAIM_CELLS = 2  # a detection claims the surfels up to so many cells around tho
 # Without scanner positions: a second instance shows at least this much of what the best one shows (another spool in a
 # shop: 0.61).
 BLIND_SHARE = 0.7
+DRIFT_CELLS = 3  # of a gate of one cell, and two that a pose may still move after the coarse steps
+ALL_SAMPLES = 1 << 30
+# Share of the score asked for that the evidence on the coarse surfels must reach: there 400 samples tell the final
+# score of a shop's 96 best poses within 0.2.
+PROMISING = 0.67
 REFUSED_SHOWN = 3  # of each model: what came closest
 
 
@@ -80,7 +85,7 @@ class Recognition:
             self._ran_out_of_time = limits.miss_probability > 0.0
             return False
         if limits.miss_probability <= 0.0:
-            return len(self.search.pool) > 1
+            return self.search.pool_left()
         enough = limits.max_instances is not None and len(self.believed) >= limits.max_instances
         return not enough and not self.search.may_stop()
 
@@ -92,7 +97,7 @@ class Recognition:
         return min(1.0, log(max(self.search.chance_missed(), limit)) / log(limit))
 
     def refine(self, hypotheses: Hypotheses) -> Refined:
-        """ICP of what is distinct among the hypotheses on the coarse surfels; of the best of those on the fine ones."""
+        """ICP of what is distinct among the hypotheses on the coarse surfels; of what these do not refute, the fine."""
         kept, met = self.parameters.search.kept, None
         rough: list[Refined] = []
         for _ in range(BATCHES):
@@ -106,7 +111,19 @@ class Recognition:
         if met is None:
             return self._icp_fine(hypotheses)
         better = met.take(np.argsort(-np.concatenate([r.matched for r in rough]), kind="stable"))
-        return self._icp_fine(better.take(distinct(better, self.arrays, self._apart_after, kept, 2 * kept)))
+        better = better.take(distinct(better, self.arrays, self._apart_after, kept, 2 * kept))
+        return self._icp_fine(better.take(self._promising(better, REFUSED_SHOWN)))
+
+    def _promising(self, hypotheses: Hypotheses, shown: int) -> NDArray[np.intp]:
+        """Those whose evidence on the coarse surfels is not hopeless, and the best `shown` of each model (indices)."""
+        verify, few = self.parameters.verify, self.parameters.refine.coarse_samples
+        evidence = self._evidence(hypotheses, self.scene.coarse, few)
+        scores = np.array([rough_score(seen, self.blind, verify) for seen in evidence])
+        kept = scores >= PROMISING * verify.min_score
+        for model in np.unique(hypotheses.models):
+            theirs = np.flatnonzero(hypotheses.models == model)
+            kept[theirs[np.argsort(-scores[theirs], kind="stable")[:shown]]] = True
+        return np.flatnonzero(kept)
 
     def _far_from(self, hypotheses: Hypotheses, met: Hypotheses) -> NDArray[np.intp]:
         """The hypotheses that would not be drawn to where those in `met` went already (indices)."""
@@ -124,6 +141,7 @@ class Recognition:
 
     def _icp_fine(self, hypotheses: Hypotheses) -> Refined:
         refine, fine = self.parameters.refine, self.scene.fine
+        self._fit_near(hypotheses, DRIFT_CELLS)
         gates = shrinking(refine.fine_gates, refine.fine_iterations, fine.cell)
         return self._icp(hypotheses, fine, gates, refine.fine_samples)
 
@@ -131,10 +149,28 @@ class Recognition:
         agreement = self.parameters.refine.normal_agreement
         return icp(hypotheses, surfels, self.arrays, self.signed, gates, most_samples, agreement, self.jobs)
 
+    def _fit_near(self, hypotheses: Hypotheses, reach: int) -> None:
+        """Fit the fine surfels up to `reach` cells from the placed samples of some poses."""
+        near = self._no_rows()
+        for number, rotation, translation in zip(*hypotheses[:3], strict=True):
+            samples = self.arrays.points[self.arrays.starts[number] : self.arrays.starts[number + 1]]
+            self._mark(samples @ rotation.T + translation, reach, near)
+        self.scene.fine.fit(near[self.scene.fine.cells.rows])
+
+    def _no_rows(self) -> NDArray[np.bool_]:
+        return np.zeros(len(self.scene.fine.sides), np.bool_)
+
+    def _evidence(self, hypotheses: Hypotheses, surfels: Surfels, most_samples: int) -> list[Evidence]:
+        return gather(
+            hypotheses, self.scene, surfels, most_samples, self.telling if surfels is self.scene.fine else None,
+            self.arrays, self.signed, self.parameters.verify, self.jobs,
+        )  # fmt: skip
+
     def candidates(self, refined: Refined) -> list[Candidate]:
         """Refined poses with their evidence."""
         verify = self.parameters.verify
-        evidence = gather(refined.hypotheses, self.scene, self.telling, self.arrays, self.signed, verify, self.jobs)
+        self._fit_near(refined.hypotheses, 1)
+        evidence = self._evidence(refined.hypotheses, self.scene.fine, ALL_SAMPLES)
         found = []
         for k, seen in enumerate(evidence):
             number = int(refined.hypotheses.models[k])
@@ -164,7 +200,7 @@ class Recognition:
                 self._refused.append((candidate, reason))
             else:
                 fresh.append(candidate)
-        claimed, believed = np.zeros(len(self.scene.fine.means), np.bool_), []
+        claimed, believed = self._no_rows(), []
         for candidate in sorted([*self.believed, *fresh], key=lambda c: -c.area):
             if self._shares(candidate, claimed):
                 self._refused.append((candidate, "another pose explains more of the same surface"))
@@ -179,7 +215,7 @@ class Recognition:
             self._claim(best, claimed)
         self.believed = self._shown_alike(believed) if self.blind else believed
         self._refused = closest(self._refused)
-        self.search.withdraw(np.flatnonzero(claimed))
+        self.search.withdraw(claimed[self.scene.fine.cells.rows])
 
     def _shown_alike(self, believed: Sequence[Candidate]) -> list[Candidate]:
         """Of each model those that show nearly as much of themselves as the best one: where free space says nothing, a
@@ -195,14 +231,15 @@ class Recognition:
         return alike
 
     def _claim(self, candidate: Candidate, claimed: NDArray[np.bool_]) -> None:
-        """Mark the surface a pose claims: its samples are too few to name every surfel of it themselves."""
+        """Mark the cells a pose claims: its samples are too few to name every cell of its surface themselves."""
+        self._mark(self.scene.fine.means[candidate.evidence.claims], CLAIM_CELLS, claimed)
+
+    def _mark(self, points: Floats, reach: int, marked: NDArray[np.bool_]) -> None:
+        """Mark the rows of the fine cells up to `reach` cells from points (N, 3)."""
         from scanfind.kernels.nearest import mark_around
 
-        fine = self.scene.fine
-        mark_around(
-            candidate.evidence.claims, CLAIM_CELLS, fine.cell, fine.hash_keys, fine.hash_values, fine.block_cells,
-            fine.first_surfel, fine.means, claimed,
-        )  # fmt: skip
+        at = self.scene.fine.cells
+        mark_around(points, reach, at.cell, at.hash_keys, at.hash_values, at.block_rows, marked)
 
     def _hits(self, hypotheses: Hypotheses, found: Candidate) -> int:
         """How many of a round's hypotheses lead to a pose, or to one it is turned onto by the model's symmetry."""
@@ -222,7 +259,7 @@ class Recognition:
 
     def _shares(self, candidate: Candidate, claimed: NDArray[np.bool_]) -> bool:
         """Is too much of what supports a pose claimed by others already?"""
-        claims = candidate.evidence.claims
+        claims = self.scene.fine.cells.rows[self.scene.fine.cell_of[candidate.evidence.claims]]
         return bool(claimed[claims].mean() > self.parameters.verify.shared) if len(claims) else True
 
     def _best_of_similar(self, candidate: Candidate) -> Candidate:
@@ -237,7 +274,8 @@ class Recognition:
         if not others:
             return candidate
         turned = self._placements(number, others)
-        refined = self._icp_fine(self._icp_coarse(turned).hypotheses)
+        met = self._icp_coarse(turned).hypotheses
+        refined = self._icp_fine(met.take(self._promising(met, 0)))
         sound = [c for c in self.candidates(refined) if not why_refused(c.evidence, self.blind, self.parameters.verify)]
         return max([candidate, *sound], key=lambda c: c.area)
 
@@ -257,7 +295,7 @@ class Recognition:
         )  # fmt: skip
 
     def _pose(self, found: Candidate) -> Pose:
-        return Pose(found.rotation, found.translation + self.scene.fine.offset)
+        return Pose(found.rotation, found.translation + self.scene.fine.cells.offset)
 
     def _unobservable(self, found: Candidate) -> tuple[Motion, ...]:
         """In the model's own axes."""

@@ -68,15 +68,15 @@ def icp(
     """
     from scanfind.kernels.icp import refine_poses
 
-    count = len(hypotheses.models)
+    count, cells = len(hypotheses.models), surfels.cells
     rotations, translations = hypotheses.rotations.copy(), hypotheses.translations.copy()
     hessians, matched, rms = np.zeros((count, 6, 6)), np.zeros(count), np.full(count, np.inf)
     in_threads(
         jobs, count,
         lambda start, stop: refine_poses(
             start, stop, hypotheses.models, arrays.starts, arrays.points, arrays.normals, arrays.centres, arrays.radii,
-            most_samples, gates, normal_agreement, signed, surfels.cell, surfels.hash_keys, surfels.hash_values,
-            surfels.block_cells, surfels.first_surfel, surfels.means, surfels.normals,
+            most_samples, gates, normal_agreement, signed, cells.cell, cells.hash_keys, cells.hash_values,
+            cells.block_rows, surfels.first_surfel, surfels.sides, surfels.means, surfels.normals,
             rotations, translations, hessians, matched, rms,
         ),
     )  # fmt: skip

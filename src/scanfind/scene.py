@@ -3,18 +3,49 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.surfels import DepthMap, GridParameters, MomentGrid, Surfels, empty_hash
+from scanfind.depth import DepthMap
+from scanfind.errors import require
+from scanfind.moments import MomentGrid
+from scanfind.surfels import Surfels, empty_hash
 
 Floats = NDArray[np.float64]
 
 SMALLEST_CELL_M = 1e-3
+NOISE_SURFELS = 20_000  # tell the noise: of a median within a hundredth
+
+
+@dataclass(frozen=True)
+class GridParameters:
+    """How the scene is resampled.
+
+    cell_m : edge of a cell, metres; None: `cells_across` of them along the smallest model's diameter, made larger
+        until the scan fills them
+    cells_across : how many cells the diameter of the smallest model spans; 180 makes 20 mm of a 3.6 m spool
+    least_cells_across : never fewer, however sparse the scan
+    points_per_cell : a cell must hold so many points on average, or cells are doubled; fewer make poor normals
+    min_neighbours : occupied cells of the 3×3×3 (itself included) below which a cell has no normal, only presence
+    """
+
+    cell_m: float | None = None
+    cells_across: float = 180.0
+    least_cells_across: float = 30.0
+    points_per_cell: float = 1.25
+    min_neighbours: int = 5
+
+    def __post_init__(self) -> None:
+        require(self.cell_m is None or 0.0 < self.cell_m < 100.0, "cell_m", self.cell_m, "a length up to 100 metres")
+        require(self.least_cells_across >= 1.0, "least_cells_across", self.least_cells_across, "1 or more")
+        require(
+            self.cells_across >= self.least_cells_across, "cells_across", self.cells_across, "no less than the least"
+        )
+        require(self.points_per_cell >= 0.0, "points_per_cell", self.points_per_cell, "0 or more")
+        require(1 <= self.min_neighbours <= 27, "min_neighbours", self.min_neighbours, "from 1 to 27")
 
 
 class OrientationGrid(NamedTuple):
@@ -37,10 +68,9 @@ class OrientationGrid(NamedTuple):
 class Scene:
     """A scene, resampled.
 
-    fine : cells for verification and ICP; coarse : cells of twice the edge, for ICP's first steps
+    fine : cells for drawing, verification and ICP, fitted where they are asked for
+    coarse : cells of twice the edge, for ICP's first steps; around : of four times, for the shape around a cell
     tolerant : cells for the sequential test
-    bends : (S,) for each fine surfel, standard deviation across the plane of the `window` around it, metres
-    window : edge of that cube, metres
     depths : what each known scanner position saw; empty where none is known
     noise : spread of raw points across the median surfel: the scanner's noise, metres (see `quiet`)
     points, unaddressable : raw points in the grid, and those too far from the rest to be
@@ -48,9 +78,8 @@ class Scene:
 
     fine: Surfels
     coarse: Surfels
+    around: Surfels
     tolerant: OrientationGrid
-    bends: Floats
-    window: float
     depths: list[DepthMap]
     noise: float
     points: int
@@ -88,43 +117,36 @@ def build_scene(
         while grid.points_per_row() < parameters.points_per_cell and 2.0 * grid.cell <= largest_cell:
             grid = grid.coarser()
     half = grid.coarser()
-    fine = grid.surfels(parameters.min_neighbours, jobs)
-    test_cell = max(diameter / test_cells_across, 2.0 * grid.cell)
-    with ThreadPoolExecutor(1) as beside:  # marking is one long loop: a second core does the coarser levels meanwhile
-        marked = beside.submit(orientation_grid, fine, 0.5 * test_cell, test_cell)
-        coarse = half.surfels(parameters.min_neighbours, jobs)
-        around = half.coarser().surfels(1, jobs)
-        tolerant = marked.result()
-    bends = flatness_around(fine, around)
+    quarter = half.coarser()
+    fine = Surfels(grid, parameters.min_neighbours, jobs)
+    coarse = Surfels(half, parameters.min_neighbours, jobs).fit()
+    around = Surfels(quarter, 1, jobs).fit()
+    test_cell = max(diameter / test_cells_across, coarse.cell)
+    tolerant = orientation_grid(coarse, 0.5 * test_cell, test_cell)
     return Scene(
-        fine,
-        coarse,
-        tolerant,
-        bends,
-        3.0 * around.cell,
-        grid.depth_maps(),
-        quiet(fine.flatness),
-        grid.points,
-        grid.unaddressable,
-    )
+        fine, coarse, around, tolerant, grid.depth_maps(), noise_of(fine), grid.points, grid.unaddressable
+    )  # fmt: skip
 
 
-def quiet(flatness: Floats) -> float:
-    """The noise in some surfels' flatness, metres: its median.
+def noise_of(surfels: Surfels) -> float:
+    """The noise in a scan, metres: the flatness of its median surfel, of some.
 
-    Edges and bends spread the upper half, and quantised ranges (a Kinect's) lie in one plane in much of the lower.
+    The median: edges and bends spread the upper half, and quantised ranges (a Kinect's) lie in one plane in much of the
+    lower.
     """
-    return float(np.median(flatness)) if len(flatness) else 0.0
+    some = np.arange(0, len(surfels.cells), max(1, len(surfels.cells) // NOISE_SURFELS))
+    fitted = surfels.of(some)
+    return float(np.median(surfels.flatness[fitted])) if len(fitted) else 0.0
 
 
-def flatness_around(fine: Surfels, around: Surfels) -> Floats:
-    """For each fine surfel the flatness of the window around the coarse cell it lies in, (S,), metres."""
-    from scanfind.kernels.shape import look_up_flatness
+def flatness_above(fine: Surfels, around: Surfels) -> NDArray[np.float32]:
+    """For each fine cell the flatness about the cell two levels above it, (V,), metres."""
+    from scanfind.kernels.shape import spread_down
 
-    found = np.empty(len(fine.means))
-    look_up_flatness(
-        fine.means, around.cell, around.hash_keys, around.hash_values, around.block_cells, around.first_surfel,
-        around.flatness, found,
+    found, cells, above = np.empty(len(fine.cells), np.float32), fine.cells, around.cells
+    spread_down(
+        2, cells.block_keys, cells.order, cells.first_cell, cells.locals, above.hash_keys, above.hash_values,
+        above.block_rows, around.flatness[around.first_surfel], found,
     )  # fmt: skip
     return found
 

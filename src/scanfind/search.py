@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from scanfind.errors import require
 from scanfind.pairs import rung_distance, rungs_of
+from scanfind.scene import flatness_above
 from scanfind.surfels import empty_hash
 from scanfind.threads import in_threads
 
@@ -26,23 +27,25 @@ Floats = NDArray[np.float64]
 AREA_OF_A_SAMPLE = 1.4
 # What was found first was easier to find than what was not: its rate is halved before it is asked of others.
 LEARNT = 0.5
-# Fewer surfels than this make pairs that repeat each other.
-LEAST_POOL = 20_000
+# Cells drawn from: fewer make pairs that repeat each other, more cost more to fit than they add to a round's pairs.
+LEAST_POOL, MOST_POOL = 20_000, 100_000
+# Rounds after the first: a little more than is missing, and enough to be worth refining.
+ROUND_MARGIN, LEAST_ROUND = 1.1, 0.2
 # With so many scanner positions nearly every sample faces one, and asking costs more than it tells.
 FACING_ORIGINS = 6
-# Directions on the sphere a second point is sought in, drawn once: 0.4 MB stay in the cache, where a sine and a cosine
-# a try would cost more than the look-up they lead to.
-DIRECTIONS = 1 << 14
 PARTNERS_COUNTED = 40  # surfels whose partners are counted, each against all of the pool
-# Bins a pair distance: a try takes any surfel of the bin a direction leads to (kernels.search.draw_pairs).
+# Bins a pair distance: 1,600 of them make the shell a partner is sought in (kernels.search.draw_seconds).
 BINS_A_DISTANCE = 6
 # Borders between classes of bend, in shares of the window: range noise of 2 mm on a plane is below the first for
 # windows over 0.1 m, a pipe as wide as the window above the last.
 BEND_BORDERS = (0.02, 0.05, 0.1)
 # A pair that lies on an instance finds it when noise left its feature in the right cell of the hash table and one of
-# the model's pairs there is near enough: measured 0.3 – 1 on shop scenes, 0.1 on a pump. Only until an instance is
+# the model's pairs there is near enough: measured 0.5 on spools, 0.05 – 0.4 on frames. Only until an instance is
 # found; then it is counted (Search.learn).
-RIGHT_PAIR_FINDS = 0.2
+RIGHT_PAIR_FINDS = 0.05
+# A surfel's normal counts as clean below so much of a cell, noise apart; but never fewer than this share of a shape's.
+# Drawing only those doubled the right poses a round finds, on spools and frames.
+CLEAN_CELLS, CLEAN_SHARE = 0.1, 0.3
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ class SearchParameters:
     telling_first : test pairs first whose feature is rare in this scene: the chance of a pair to be right, over the
         cost of testing it, is one over how often the scene shows its feature
     normal_length_m : of the normals in the four-point sets (the paper: 1); 0: its limit, the roll alone from normals
-    max_tries : directions tried from s1 before another is drawn
+    max_tries : places tried for s2 before another s1 is drawn
     tests : model samples in the sequential test
     chance_overlap : share of samples of a wrong hypothesis that lie on the scene, for Wald's test
     test_cells_across : cells of the test along the diameter of the smallest model
@@ -179,19 +182,17 @@ class Search:
         self.parameters, self.seed, self.jobs = parameters, seed, jobs
         self.pairs = models[0].parameters.pairs
         self.rungs = sorted({rung for m in models for rung in rungs_of(m.diameter, m.parameters.pairs)}, reverse=True)
-        self._classes = shape_classes(scene.bends, scene.window)
-        self._free = scene.fine.has_normal()
+        window = 3.0 * scene.around.cell
+        self._classes = shape_classes(flatness_above(scene.fine, scene.around), window)
+        self._free = np.ones(len(scene.fine.cells), np.bool_)
         known = parameters.facing_only and scene.fine.signed and len(scene.depths) <= FACING_ORIGINS
         self._origins = scene.origins() if known else np.empty((0, 3))
-        self.model_shapes = np.array([model_shape(model, scene.window) for model in models])
+        self.model_shapes = np.array([model_shape(model, window) for model in models])
         # As far as two samples of a model may be off, but never less than the scene's own resampling.
         self._tolerance = max(scene.fine.cell, self.pairs.tolerance * min(model.spacing for model in models))
+        self.rounds, self.effort = 0, 0.0
         self.pool = np.empty(0, np.intp)
         self._fill_pool()
-        way = np.random.default_rng(seed).standard_normal((DIRECTIONS, 3))
-        self._directions = way / np.linalg.norm(way, axis=1)[:, None]
-        self.rounds = 0
-        self.drawn = self.tested = self.hypotheses = self.lookups = 0
         self._expected = np.zeros(len(models))
         self._learned = np.zeros((len(models), 2))  # hits, and what was shown, of the instances found
         self._sides = 1 if scene.fine.signed and all(m.signed for m in models) else 4
@@ -200,38 +201,57 @@ class Search:
         right = wanted + (1.0 - wanted) * parameters.chance_overlap
         self._least_hits = wald_table(parameters.tests, right, parameters.chance_overlap)
 
-    def withdraw(self, surfels: NDArray[np.intp]) -> None:
-        """Draw no more from these surfels (indices): they are explained."""
-        self._free[surfels] = False
-        self._fill_pool()
+    def withdraw(self, cells: NDArray[np.bool_]) -> None:
+        """Draw no more from these cells (V,): they are explained."""
+        self._free &= ~cells
+        self._stale = True
 
     def _fill_pool(self) -> None:
-        """Choose the surfels that may be drawn: each with a chance by the likelihood ratio of its shape."""
+        """Choose the surfels that may be drawn: each cell's with a chance by the likelihood ratio of its shape."""
         counts, kept = self._likelihood(self._free)
-        # Where the telling surfels are few, the others fill up: they may be all there is to draw from.
+        kept = kept * min(1.0, MOST_POOL / max(float(kept @ counts), 1.0))
+        # Where the telling cells are few, the others fill up: they may be all there is to draw from.
         while 0 < np.minimum(kept, 1.0) @ counts < min(LEAST_POOL, 0.9 * counts.sum()):
             kept = kept * 1.25
         self._kept = np.minimum(kept, 1.0)
-        chance = np.where(self._free, self._kept[self._classes], 0.0)
-        luck = np.random.default_rng([self.seed, len(self.pool)]).random(len(chance))
-        self.pool = np.flatnonzero(luck < chance)
+        luck = np.random.default_rng([self.seed, self.rounds]).random(len(self._classes), np.float32)
+        chance = self._kept.astype(np.float32)[self._classes]
+        fine = self.scene.fine
+        surfels = fine.of(np.flatnonzero(self._free & (luck < chance)))
+        surfels = surfels[fine.has_normal()[surfels]]
+        self.pool = surfels[self._clean(surfels)]
+        self._stale = False
         self._bins = {
-            rung: bin_pool(self.pool, self.scene.fine.means, rung_distance(rung, self.pairs) / BINS_A_DISTANCE)
+            rung: bin_pool(self.pool, fine.means, rung_distance(rung, self.pairs), self._tolerance)
             for rung in self.rungs
         }
 
+    def _clean(self, surfels: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Which surfels have a normal to rely on: flat but for noise, or among the flatter ones of their shape.
+
+        Across an edge a normal is of neither face, and near edges is where most of the telling surfels are.
+        """
+        fine, classes = self.scene.fine, self._classes[self.scene.fine.cell_of[surfels]]
+        flatness = fine.flatness[surfels]
+        clean = flatness <= np.hypot(self.scene.noise, CLEAN_CELLS * fine.cell)
+        for shape in np.unique(classes):
+            alike = classes == shape
+            clean[alike] |= flatness[alike] <= np.quantile(flatness[alike], CLEAN_SHARE)
+        return clean
+
     def telling(self) -> Floats:
-        """How much each surfel tells, (S,), 0 … 1: the root of the likelihood ratio of its shape, model against scene.
+        """How much the surfels of each cell tell, (V,), 0 … 1: the root of the likelihood ratio of its shape, model
+        against scene.
 
         A plate flush with a floor lies on the scene with all of its samples, and that means nothing.
         """
-        _, likelihood = self._likelihood(self.scene.fine.has_normal())
+        _, likelihood = self._likelihood(np.ones(len(self._classes), np.bool_))
         return np.asarray(np.sqrt(likelihood)[self._classes])
 
     def _likelihood(self, among: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Floats]:
-        """Of C classes of shape, how many of some surfels are in each, and its likelihood ratio over the largest, (C,).
+        """Of C classes of shape, how many of some cells are in each, and its likelihood ratio over the largest, (C,).
 
-        among : (S,) which surfels
+        among : (V,) which cells
         """
         counts = np.bincount(self._classes[among], minlength=len(BEND_BORDERS) + 1)
         if not self.parameters.by_shape:
@@ -241,53 +261,70 @@ class Search:
 
     def may_stop(self) -> bool:
         """Is nothing left to draw from, or the chance to have missed an instance of any model below the one allowed?"""
-        return len(self.pool) < 2 or self.chance_missed() < self.parameters.miss_probability
+        return not self.pool_left() or self.chance_missed() < self.parameters.miss_probability
+
+    def pool_left(self) -> bool:
+        """Is there a pair left to draw?"""
+        return len(self.pool) > 1 and bool(np.count_nonzero(self._free) > 1)
 
     def chance_missed(self) -> float:
         """Chance to have missed an instance that shows λs of its surface, for the model worst served so far."""
-        expected = np.where(self._learned[:, 1] > 0.0, self.rounds * self._rate(), self._expected)
+        expected = np.where(self._learned[:, 1] > 0.0, self.effort * self._rate(), self._expected)
         return exp(-float(expected.min()))
+
+    def _share(self) -> float:
+        """The share of a full round that the next one needs be: the first is full, the others as much as is missing."""
+        allowed, missed = self.parameters.miss_probability, self.chance_missed()
+        if self.effort == 0.0 or allowed == 0.0 or missed == 1.0:
+            return 1.0
+        needed = self.effort * (log(allowed) / log(missed) - 1.0)
+        return min(1.0, max(LEAST_ROUND, ROUND_MARGIN * needed))
 
     def learn(self, model: int, hits: int, support: float) -> None:
         """Learn from an instance how often a round hits one: pairs on it go with the square of what it shows."""
         self._learned[model] += hits, (support / self.parameters.overlap_ratio) ** 2
 
     def _rate(self) -> Floats:
-        """Hits a round of an instance of each model that shows λs of its surface, from what was found, (models,)."""
+        """Hits a full round of an instance of each model that shows λs of its surface, from those found, (models,)."""
         return np.asarray(LEARNT * self._learned[:, 0] / np.maximum(self._learned[:, 1], 1e-300))
 
     def round(self) -> Hypotheses:
         """One round: draw pairs, look them up, test their hypotheses; the best of each pair that pass, best first."""
         from scanfind.kernels.search import test_pairs
 
-        first, second, signs, keys = self._telling_pairs()
+        if self._stale:
+            self._fill_pool()
+        if len(self.pool) < 2:
+            return Hypotheses(np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0))
+        share = self._share()
+        first, second, signs, keys = self._telling_pairs(share)
         count = len(first)
         support, models = np.zeros(count), np.zeros(count, np.int64)
         rotations, translations = np.empty((count, 3, 3)), np.empty((count, 3))
         fine, tolerant, table, arrays = self.scene.fine, self.scene.tolerant, self.table, self.arrays
 
-        def test(start: int, stop: int) -> NDArray[np.int64]:
-            work = np.zeros(2, np.int64)
-            test_pairs(
+        in_threads(
+            self.jobs, count,
+            lambda start, stop: test_pairs(
                 start, stop, first, second, signs, keys, fine.means, fine.normals,
                 table.offsets, table.model, table.first, table.second, arrays.starts, arrays.points, arrays.normals,
                 arrays.samples, self.parameters.normal_length_m, tolerant.cell, tolerant.hash_keys,
                 tolerant.hash_values, tolerant.occupied, tolerant.masks, self._least_hits, self._origins,
-                support, models, rotations, translations, work,
-            )  # fmt: skip
-            return work
-
-        work = np.sum(in_threads(self.jobs, count, test) or [np.zeros(2, np.int64)], axis=0)
-        self.hypotheses += int(work[0])
-        self.lookups += int(work[1])
-        self.tested += count
+                support, models, rotations, translations,
+            ),
+        )  # fmt: skip
         self.rounds += 1
+        self.effort += share
         order = np.argsort(-support, kind="stable")[: np.count_nonzero(support)]
         return Hypotheses(models[order], rotations[order], translations[order], support[order])
 
-    def _telling_pairs(self) -> tuple[NDArray[np.int64], ...]:
-        """Draw a round's pairs; of those the library knows, the most telling that the round can afford to test."""
-        columns = [self._draw(rung) for rung in self.rungs]
+    def _telling_pairs(self, share: float) -> tuple[NDArray[np.int64], ...]:
+        """Draw a round's pairs; of those the library knows, the most telling that the round can afford to test.
+
+        share : of a full round, 0 … 1
+        """
+        count = round(share * self.parameters.pairs_a_round / len(self.rungs))
+        columns = [self._draw(rung, count) for rung in self.rungs]
         first, second, signs, keys = (np.concatenate(column) for column in zip(*columns, strict=True))
         cost = (self.table.offsets[1:] - self.table.offsets[:-1])[keys]
         known = cost > 0
@@ -296,30 +333,31 @@ class Search:
         if self.parameters.telling_first:
             order = order[np.argsort(common[keys[order]], kind="stable")]
         # Three of four choices of sides are wrong: as many more hypotheses are tested for the same right pairs.
-        most = self.parameters.hypotheses_a_round * self._sides
+        most = share * self.parameters.hypotheses_a_round * self._sides
         affordable = np.searchsorted(np.cumsum(cost[order]), most) + 1
         order = order[:affordable]
-        self._expect(keys, keys[order])
+        self._expect(count, keys, keys[order])
         return first[order], second[order], signs[order], keys[order]
 
-    def _draw(self, rung: int) -> tuple[NDArray[np.int64], ...]:
+    def _draw(self, rung: int, count: int) -> tuple[NDArray[np.int64], ...]:
         """Pairs of scene points at one rung's distance: first, second, signs, keys, those that met a second point."""
-        from scanfind.kernels.search import draw_pairs, key_pairs
+        from scanfind.kernels.search import draw_firsts, draw_seconds, key_pairs
 
-        fine, count = self.scene.fine, self.parameters.pairs_a_round // len(self.rungs)
+        fine = self.scene.fine
+        bins, distance, stream = self._bins[rung], rung_distance(rung, self.pairs), self.rounds * 1024 + rung
         first, second = np.empty(count, np.int64), np.empty(count, np.int64)
-        bins, distance = self._bins[rung], rung_distance(rung, self.pairs)
+        draw_firsts(self.seed, stream, len(bins.pool), first)
+        order = np.argsort(bins.bin_of[first], kind="stable")
         in_threads(
             self.jobs, count,
-            lambda start, stop: draw_pairs(
-                start, stop, self.seed, self.rounds * 1024 + rung, bins.pool, bins.edge, bins.hash_keys,
-                bins.hash_values, bins.starts, fine.means, self._directions, distance, self._tolerance,
-                self.parameters.max_tries, first, second,
+            lambda start, stop: draw_seconds(
+                start, stop, order, first, self.seed, stream, bins.keys, bins.bin_of, bins.hash_keys,
+                bins.hash_values, bins.starts, bins.points, bins.shell, distance, self._tolerance,
+                self.parameters.max_tries, second,
             ),
         )  # fmt: skip
-        self.drawn += count
         met = second >= 0
-        first, second = first[met], second[met]
+        first, second = bins.pool[first[met]], bins.pool[second[met]]
         # Where nobody knows a normal's side, each pair is looked up with all four choices of sides.
         sides = self._sides
         signs = np.repeat(np.arange(sides), len(first))
@@ -332,8 +370,11 @@ class Search:
         keys[pairs] += rung * self.pairs.cells_per_rung()
         return first[pairs], second[pairs], signs[pairs], keys[pairs]
 
-    def _expect(self, drawn: NDArray[np.int64], tested: NDArray[np.int64]) -> None:
-        """Add how many right pairs this round tested of an instance of each model that shows `overlap_ratio`."""
+    def _expect(self, drawn_here: int, drawn: NDArray[np.int64], tested: NDArray[np.int64]) -> None:
+        """Add how many right pairs this round tested of an instance of each model that shows `overlap_ratio`.
+
+        drawn_here : pairs at each rung; drawn, tested : keys of those that met a second point, and of those tested
+        """
         cells, fine, shown = len(self.table.offsets) - 1, self.scene.fine, self.parameters.overlap_ratio
         count = np.bincount(drawn, minlength=cells)
         # None of a feature that was not drawn was left out: without this a scan too small for a pair is never done.
@@ -352,7 +393,6 @@ class Search:
                 shell = 2.0 * model.parameters.pairs.tolerance * model.spacing
                 partners = on_it * len(keys) / samples**2 * 2.0 * self._tolerance / shell
                 second_on_it = partners / max(self._partners(rung), partners, 1e-9)
-                drawn_here = self.parameters.pairs_a_round / len(self.rungs)
                 right = drawn_here * first_on_it * second_on_it * float(share[keys].mean())
                 self._expected[number] += RIGHT_PAIR_FINDS * right
 
@@ -362,41 +402,62 @@ class Search:
 
         bins = self._bins[rung]
         if bins.partners < 0.0:
-            some = self.pool[:: max(1, len(self.pool) // PARTNERS_COUNTED)]
-            found = count_partners(
-                some, self.pool, self.scene.fine.means, rung_distance(rung, self.pairs), self._tolerance
-            )
+            some = bins.points[:: max(1, len(bins.points) // PARTNERS_COUNTED)]
+            found = count_partners(some, bins.points, rung_distance(rung, self.pairs), self._tolerance)
             self._bins[rung] = bins = bins._replace(partners=float(found))
         return bins.partners
 
 
 class Bins(NamedTuple):
-    """The pool sorted into cubes of one edge, metres: bin b holds pool[starts[b]:starts[b+1]]; partners: see Search."""
+    """The pool sorted into cubes of one edge: bin b holds pool[starts[b]:starts[b+1]].
 
-    edge: float
+    pool : (W,) surfels; points : (W, 3) where they are, side by side; bin_of : (W,) the bin of each
+    keys : (bins,) packed coordinates; hash_keys, hash_values : from them to the bin
+    shell : (Q, 3) int64, from a bin to all those that may hold a point at the pair distance from one in it
+    partners : how many of the pool lie at the distance from one of them; -1 until counted (see Search)
+    """
+
     pool: NDArray[np.intp]
+    points: Floats
+    bin_of: NDArray[np.int64]
+    keys: NDArray[np.int64]
     hash_keys: NDArray[np.int64]
     hash_values: NDArray[np.int32]
     starts: NDArray[np.int64]
+    shell: NDArray[np.int64]
     partners: float
 
 
-def bin_pool(pool: NDArray[np.intp], means: Floats, edge: float) -> Bins:
-    """Sort surfels into cubes of an edge in metres."""
+def bin_pool(pool: NDArray[np.intp], means: Floats, distance: float, tolerance: float) -> Bins:
+    """Sort surfels into cubes, BINS_A_DISTANCE of them a pair distance ± tolerance, metres."""
     from scanfind.kernels.blocks import BIAS, fill_hash
 
-    x, y, z = (np.floor(means[pool] / edge).astype(np.int64) + BIAS).T
+    points, edge = means[pool], distance / BINS_A_DISTANCE
+    x, y, z = (np.floor(points / edge).astype(np.int64) + BIAS).T
     keys = (x << 40) | (y << 20) | z
     order = np.argsort(keys, kind="stable")
     bins, starts = np.unique(keys[order], return_index=True)
+    starts = np.append(starts, len(pool))
     hash_keys, hash_values = empty_hash(len(bins))
     fill_hash(bins, hash_keys, hash_values)
-    return Bins(edge, pool[order], hash_keys, hash_values, np.append(starts, len(pool)), -1.0)
+    return Bins(
+        pool[order], points[order], np.repeat(np.arange(len(bins)), np.diff(starts)), bins, hash_keys, hash_values,
+        starts, shell_of(distance / edge, tolerance / edge), -1.0,
+    )  # fmt: skip
 
 
-def shape_classes(bends: Floats, window: float) -> NDArray[np.int8]:
-    """Class of each point by how bent the surface around it is, (S,); bends : (S,), window : both metres."""
-    return np.digitize(bends, np.array(BEND_BORDERS) * window).astype(np.int8)
+def shell_of(distance: float, tolerance: float) -> NDArray[np.int64]:
+    """Steps (Q, 3) between unit cubes that hold points at distance ± tolerance from one another."""
+    reach = int(np.ceil(distance + tolerance)) + 1
+    steps = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    nearest = np.linalg.norm(np.maximum(np.abs(steps) - 1, 0), axis=1)
+    farthest = np.linalg.norm(np.abs(steps) + 1, axis=1)
+    return np.asarray(steps[(nearest <= distance + tolerance) & (farthest >= distance - tolerance)])
+
+
+def shape_classes(bends: NDArray[np.floating], window: float) -> NDArray[np.int8]:
+    """Class of each point by how bent the surface around it is, (N,); bends : (N,), window : both metres."""
+    return np.asarray(np.digitize(bends, np.array(BEND_BORDERS) * window), np.int8)
 
 
 def model_shape(model: Model, window: float) -> Floats:

@@ -28,6 +28,17 @@ def in_threads(jobs: int, count: int, work: Callable[[int, int], Result]) -> lis
         return list(pool.map(work, bounds[:-1], bounds[1:]))
 
 
+def side_by_side(jobs: int, *works: Callable[[], None]) -> None:
+    """Call works that do not meet, at the same time where there is more than one job."""
+    if jobs <= 1:
+        for work in works:
+            work()
+        return
+    with ThreadPoolExecutor(len(works)) as pool:
+        for running in [pool.submit(work) for work in works]:
+            running.result()
+
+
 def available_cores() -> int:
     """Cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -18,6 +18,7 @@ from scanfind.threads import in_threads
 if TYPE_CHECKING:
     from scanfind.scene import Scene
     from scanfind.search import Hypotheses, ModelArrays
+    from scanfind.surfels import Surfels
 
 Floats = NDArray[np.float64]
 
@@ -104,12 +105,17 @@ def score(evidence: Evidence, blind: bool, parameters: VerifyParameters) -> floa
 
     blind : no scanner position is known; then only support speaks, and half the surface is all that is expected of it
     """
+    visible = rough_score(evidence, blind, parameters)
+    # Few supported samples can agree by chance: the visible share is believed as far as their number goes.
+    return visible if blind else visible * float(1.0 - np.exp(-evidence.telling / BELIEVED_SUPPORT))
+
+
+def rough_score(evidence: Evidence, blind: bool, parameters: VerifyParameters) -> float:
+    """The score but for how much the supported surface tells."""
     if blind:
         return min(1.0, evidence.support() / EXPECTED_BLIND)
     spoken = evidence.supported + parameters.penalty_weight * evidence.seen_through
-    visible = evidence.supported / spoken if spoken else 0.0
-    # Few supported samples can agree by chance: the visible share is believed as far as their number goes.
-    return visible * float(1.0 - np.exp(-evidence.telling / BELIEVED_SUPPORT))
+    return evidence.supported / spoken if spoken else 0.0
 
 
 def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters) -> str:
@@ -129,28 +135,32 @@ def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters) -
 
 
 def gather(
-    hypotheses: Hypotheses, scene: Scene, telling: Floats, arrays: ModelArrays, signed: bool,
-    parameters: VerifyParameters, jobs: int,
+    hypotheses: Hypotheses, scene: Scene, surfels: Surfels, most_samples: int, telling: Floats | None,
+    arrays: ModelArrays, signed: bool, parameters: VerifyParameters, jobs: int,
 ) -> list[Evidence]:  # fmt: skip
-    """The evidence of each of H hypotheses; telling (S,) is how much each surfel tells (Search.telling)."""
+    """The evidence of each of H hypotheses.
+
+    surfels : of the level of the scene it is gathered on; most_samples : of each model
+    telling : (V,) how much the surfels of each cell tell (Search.telling); None: nothing
+    """
     from scanfind.kernels.evidence import HIDDEN, SEEN_THROUGH, SUPPORTED, gather_evidence
 
-    sizes = (arrays.starts[1:] - arrays.starts[:-1])[hypotheses.models]
+    sizes = np.minimum(arrays.starts[1:] - arrays.starts[:-1], most_samples)[hypotheses.models]
     ends = np.cumsum(sizes)
     total = int(ends[-1]) if len(ends) else 0
     states, residuals, claims = np.empty(total, np.uint8), np.empty(total, np.float32), np.empty(total, np.int32)
-    fine = scene.fine
+    cells, cell = surfels.cells, surfels.cell
     origins, ranges = scene.origins(), scene.ranges()
-    inlier = parameters.inlier_noises * scene.noise + parameters.inlier_cells * fine.cell
-    margin = parameters.margin_inliers * inlier + parameters.margin_cells * fine.cell
+    inlier = parameters.inlier_noises * scene.noise + parameters.inlier_cells * cell
+    margin = parameters.margin_inliers * inlier + parameters.margin_cells * cell
     edge = scene.depths[0].edge if scene.depths else 1
     in_threads(
         jobs, len(sizes),
         lambda start, stop: gather_evidence(
-            start, stop, hypotheses.models, arrays.starts, arrays.points, arrays.normals, hypotheses.rotations,
-            hypotheses.translations, parameters.gate_cells * fine.cell, inlier,
-            parameters.normal_agreement, signed, fine.cell, fine.hash_keys, fine.hash_values, fine.block_cells,
-            fine.first_surfel, fine.means, fine.normals, origins, ranges, edge, margin,
+            start, stop, hypotheses.models, arrays.starts, arrays.points, arrays.normals, most_samples,
+            hypotheses.rotations, hypotheses.translations, parameters.gate_cells * cell, inlier,
+            parameters.normal_agreement, signed, cell, cells.hash_keys, cells.hash_values, cells.block_rows,
+            surfels.first_surfel, surfels.sides, surfels.means, surfels.normals, origins, ranges, edge, margin,
             parameters.least_facing, ends - sizes, states, residuals, claims,
         ),
     )  # fmt: skip
@@ -162,7 +172,7 @@ def gather(
         found.append(
             Evidence(
                 int(stop - start), int(on.sum()), int((state == SEEN_THROUGH).sum()), int((state == HIDDEN).sum()),
-                float(telling[claim[on]].sum()) / int(stop - start),
+                0.0 if telling is None else float(telling[surfels.cell_of[claim[on]]].sum()) / int(stop - start),
                 float(np.sqrt(squares.mean())) if len(squares) else float("inf"), np.unique(claim[on]).astype(np.intp),
             )
         )  # fmt: skip

@@ -9,19 +9,21 @@ from numba import njit
 
 from scanfind.kernels.grid import cube_pixel
 from scanfind.kernels.nearest import nearest_surfel
+from scanfind.kernels.placed import placed
 
 NO_EVIDENCE, SUPPORTED, SEEN_THROUGH, HIDDEN = 0, 1, 2, 3
 
 
 @njit(cache=True, nogil=True)
 def gather_evidence(
-    start, stop, models, model_starts, model_points, model_normals, rotations, translations,
-    gate, inlier, least_cosine, signed, cell, hash_keys, hash_values, block_cells, first_surfel, means, normals,
+    start, stop, models, model_starts, model_points, model_normals, most_points, rotations, translations,
+    gate, inlier, least_cosine, signed, cell, hash_keys, hash_values, block_rows, first_surfel, sides, means, normals,
     origins, ranges, edge, margin, least_facing,
     first_sample, states, residuals, claims,
 ):  # fmt: skip
     """Gather the evidence of poses start … stop.
 
+    most_points : samples looked at of each model, its first ones
     gate, inlier : metres; a sample is supported by a surfel within `gate` whose plane it meets within `inlier`
     origins : (K, 3) scanner positions; ranges : (K, 6·edge²) their depth maps
     margin : metres; a beam must have gone on so far behind a sample to have passed through it
@@ -34,19 +36,13 @@ def gather_evidence(
     for h in range(start, stop):
         base = model_starts[models[h]]
         rotation, translation = rotations[h], translations[h]
-        for t in range(model_starts[models[h] + 1] - base):
-            p, m = model_points[base + t], model_normals[base + t]
-            x = rotation[0, 0] * p[0] + rotation[0, 1] * p[1] + rotation[0, 2] * p[2] + translation[0]
-            y = rotation[1, 0] * p[0] + rotation[1, 1] * p[1] + rotation[1, 2] * p[2] + translation[1]
-            z = rotation[2, 0] * p[0] + rotation[2, 1] * p[1] + rotation[2, 2] * p[2] + translation[2]
-            nx = rotation[0, 0] * m[0] + rotation[0, 1] * m[1] + rotation[0, 2] * m[2]
-            ny = rotation[1, 0] * m[0] + rotation[1, 1] * m[1] + rotation[1, 2] * m[2]
-            nz = rotation[2, 0] * m[0] + rotation[2, 1] * m[1] + rotation[2, 2] * m[2]
+        for t in range(min(most_points, model_starts[models[h] + 1] - base)):
+            x, y, z, nx, ny, nz = placed(model_points, model_normals, base + t, rotation, translation)
             at = first_sample[h] + t
             states[at], residuals[at], claims[at] = NO_EVIDENCE, np.float32(np.nan), -1
             s = nearest_surfel(
                 x, y, z, nx, ny, nz, gate, least_cosine, signed,
-                cell, hash_keys, hash_values, block_cells, first_surfel, means, normals,
+                cell, hash_keys, hash_values, block_rows, first_surfel, sides, means, normals,
             )  # fmt: skip
             if s >= 0:
                 ux, uy, uz = normals[s, 0], normals[s, 1], normals[s, 2]

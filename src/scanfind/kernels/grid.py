@@ -16,6 +16,7 @@ from scanfind.kernels.blocks import BIAS, find_block, insert_block, pack_block, 
 MOMENTS = 13  # n, Σx Σy Σz, Σxx Σxy Σxz Σyy Σyz Σzz, Σ direction to the scanner (3)
 OFFSET_UNITS = 65536.0  # offsets within a cell are counted in 1/65536 of its edge: 0.3 µm in a cell of 2 cm
 DIRECTION_UNITS = 1048576.0
+FARTHEST = 1e6  # metres: no scanner looks so far; some exporters write 1e38 for "no data"
 ROWS_OF_OCTANT = 64 * 54  # 64 cells, each seen in every one of the bins below
 VIEW_BINS = 3  # a view direction is one of 6 cube faces × 3 × 3: two in one bin are less than 35° apart
 
@@ -76,7 +77,7 @@ def add_child(parents, p, children, c, ex, ey, ez):
 @njit(cache=True, nogil=True)
 def accumulate(
     points, start, origin, has_origin, offset, cell,
-    hash_keys, hash_values, block_keys, block_cells, moments, links, counts, depth, depth_edge,
+    hash_keys, hash_values, block_keys, block_cells, moments, links, counts,
 ):  # fmt: skip
     """Add points[start:] to the grid; returns how far it came: len(points), or less where an array is full.
 
@@ -85,7 +86,6 @@ def accumulate(
     block_keys : (B,) packed; block_cells : (B, 512) a row of each cell's moments, -1 for an empty cell
     moments : (R, 13) one row for each cell and view; links : (R, 2) the row's view, and the cell's next row or -1
     counts : [blocks used, rows used, points too far away to be addressed]
-    depth : (6·edge²,) nearest range seen in each direction, metres (inf where none); only if has_origin
     """
     inverse = 1.0 / cell
     n = points.shape[0]
@@ -144,9 +144,18 @@ def accumulate(
                 m[10] += np.int64(dx * scale)
                 m[11] += np.int64(dy * scale)
                 m[12] += np.int64(dz * scale)
-                pixel = cube_pixel(-dx, -dy, -dz, depth_edge)
-                depth[pixel] = min(depth[pixel], np.float32(distance))
     return n
+
+
+@njit(cache=True, nogil=True)
+def note_ranges(points, origin, depth, edge):
+    """Keep the nearest range in each direction from a scanner; depth : (6·edge²,) metres, inf where there is none."""
+    for i in range(points.shape[0]):
+        dx, dy, dz = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+        distance = sqrt(dx * dx + dy * dy + dz * dz)
+        if 0.0 < distance < FARTHEST:
+            pixel = cube_pixel(dx, dy, dz, edge)
+            depth[pixel] = min(depth[pixel], np.float32(distance))
 
 
 @njit(cache=True, nogil=True)

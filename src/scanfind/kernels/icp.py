@@ -9,6 +9,7 @@ from numba import njit
 
 from scanfind.kernels.nearest import nearest_surfel
 from scanfind.kernels.pair_pose import turn
+from scanfind.kernels.placed import placed
 
 
 @njit(cache=True, nogil=True)
@@ -44,7 +45,7 @@ def solve_damped(hessian, gradient, damping, step):
 @njit(cache=True, nogil=True)
 def refine_poses(
     start, stop, models, model_starts, model_points, model_normals, model_centres, model_radii, most_points,
-    gates, least_cosine, signed, cell, hash_keys, hash_values, block_cells, first_surfel, means, normals,
+    gates, least_cosine, signed, cell, hash_keys, hash_values, block_rows, first_surfel, sides, means, normals,
     rotations, translations, hessians, matched, residuals,
 ):  # fmt: skip
     """Refine poses start … stop in place (paper 3.4: post-ICP), one Gauss–Newton step for each gate.
@@ -70,52 +71,20 @@ def refine_poses(
             gradient[:] = 0.0
             weights = squares = 0.0
             count = 0
+            ox = rotation[0, 0] * centre[0] + rotation[0, 1] * centre[1] + rotation[0, 2] * centre[2] + translation[0]
+            oy = rotation[1, 0] * centre[0] + rotation[1, 1] * centre[1] + rotation[1, 2] * centre[2] + translation[1]
+            oz = rotation[2, 0] * centre[0] + rotation[2, 1] * centre[1] + rotation[2, 2] * centre[2] + translation[2]
             for t in range(n):
-                p, m = model_points[base + t], model_normals[base + t]
-                qx = (
-                    rotation[0, 0] * (p[0] - centre[0])
-                    + rotation[0, 1] * (p[1] - centre[1])
-                    + rotation[0, 2] * (p[2] - centre[2])
-                )
-                qy = (
-                    rotation[1, 0] * (p[0] - centre[0])
-                    + rotation[1, 1] * (p[1] - centre[1])
-                    + rotation[1, 2] * (p[2] - centre[2])
-                )
-                qz = (
-                    rotation[2, 0] * (p[0] - centre[0])
-                    + rotation[2, 1] * (p[1] - centre[1])
-                    + rotation[2, 2] * (p[2] - centre[2])
-                )
-                ox = (
-                    rotation[0, 0] * centre[0]
-                    + rotation[0, 1] * centre[1]
-                    + rotation[0, 2] * centre[2]
-                    + translation[0]
-                )
-                oy = (
-                    rotation[1, 0] * centre[0]
-                    + rotation[1, 1] * centre[1]
-                    + rotation[1, 2] * centre[2]
-                    + translation[1]
-                )
-                oz = (
-                    rotation[2, 0] * centre[0]
-                    + rotation[2, 1] * centre[1]
-                    + rotation[2, 2] * centre[2]
-                    + translation[2]
-                )
-                nx = rotation[0, 0] * m[0] + rotation[0, 1] * m[1] + rotation[0, 2] * m[2]
-                ny = rotation[1, 0] * m[0] + rotation[1, 1] * m[1] + rotation[1, 2] * m[2]
-                nz = rotation[2, 0] * m[0] + rotation[2, 1] * m[1] + rotation[2, 2] * m[2]
+                x, y, z, nx, ny, nz = placed(model_points, model_normals, base + t, rotation, translation)
                 s = nearest_surfel(
-                    qx + ox, qy + oy, qz + oz, nx, ny, nz, gate, least_cosine, signed,
-                    cell, hash_keys, hash_values, block_cells, first_surfel, means, normals,
+                    x, y, z, nx, ny, nz, gate, least_cosine, signed,
+                    cell, hash_keys, hash_values, block_rows, first_surfel, sides, means, normals,
                 )  # fmt: skip
                 if s < 0:
                     continue
                 ux, uy, uz = normals[s, 0], normals[s, 1], normals[s, 2]
-                distance = ux * (means[s, 0] - qx - ox) + uy * (means[s, 1] - qy - oy) + uz * (means[s, 2] - qz - oz)
+                distance = ux * (means[s, 0] - x) + uy * (means[s, 1] - y) + uz * (means[s, 2] - z)
+                qx, qy, qz = x - ox, y - oy, z - oz
                 share = distance / gate
                 weight = (1.0 - share * share) ** 2
                 count += 1

@@ -13,7 +13,7 @@ from scanfind.kernels.blocks import find_block, pack_block
 @njit(cache=True, nogil=True)
 def nearest_surfel(
     x, y, z, nx, ny, nz, gate, least_cosine, signed,
-    cell, hash_keys, hash_values, block_cells, first_surfel, means, normals,
+    cell, hash_keys, hash_values, block_rows, first_surfel, sides, means, normals,
 ):  # fmt: skip
     """The nearest surfel within `gate` metres whose normal agrees, -1 where there is none.
 
@@ -38,10 +38,10 @@ def nearest_surfel(
                     block = find_block(hash_keys, hash_values, key)
                 if block < 0:
                     continue
-                found = block_cells[block, ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7)]
-                if found < 0:
+                row = block_rows[block, ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7)]
+                if row < 0:
                     continue
-                for s in range(first_surfel[found], first_surfel[found + 1]):
+                for s in range(first_surfel[row], first_surfel[row] + sides[row]):
                     dx, dy, dz = means[s, 0] - x, means[s, 1] - y, means[s, 2] - z
                     squared = dx * dx + dy * dy + dz * dz
                     if squared >= nearest:
@@ -54,13 +54,13 @@ def nearest_surfel(
 
 
 @njit(cache=True, nogil=True)
-def mark_around(some, reach, cell, hash_keys, hash_values, block_cells, first_surfel, means, marked):
-    """Mark all surfels in the cells up to `reach` cells from some surfels' own; marked : (S,) bool, in place."""
+def mark_around(points, reach, cell, hash_keys, hash_values, block_rows, marked):
+    """Mark the rows of occupied cells up to `reach` cells from those points (N, 3) lie in; marked : bool, in place."""
     inverse = 1.0 / cell
-    for i in range(some.shape[0]):
-        cx = np.int64(floor(means[some[i], 0] * inverse))
-        cy = np.int64(floor(means[some[i], 1] * inverse))
-        cz = np.int64(floor(means[some[i], 2] * inverse))
+    for i in range(points.shape[0]):
+        cx = np.int64(floor(points[i, 0] * inverse))
+        cy = np.int64(floor(points[i, 1] * inverse))
+        cz = np.int64(floor(points[i, 2] * inverse))
         key, block = np.int64(-1), np.int64(-1)
         for ix in range(cx - reach, cx + reach + 1):
             for iy in range(cy - reach, cy + reach + 1):
@@ -71,7 +71,6 @@ def mark_around(some, reach, cell, hash_keys, hash_values, block_cells, first_su
                         block = find_block(hash_keys, hash_values, key)
                     if block < 0:
                         continue
-                    found = block_cells[block, ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7)]
-                    if found >= 0:
-                        for s in range(first_surfel[found], first_surfel[found + 1]):
-                            marked[s] = True
+                    row = block_rows[block, ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7)]
+                    if row >= 0:
+                        marked[row] = True

@@ -7,7 +7,7 @@ from math import cos, floor, pi, sin, sqrt
 import numpy as np
 from numba import njit
 
-from scanfind.kernels.blocks import find_block, pack_block
+from scanfind.kernels.blocks import find_block, pack_block, unpack_block
 from scanfind.kernels.features import angle_between, feature_key
 from scanfind.kernels.grid import cube_pixel
 from scanfind.kernels.pair_pose import frame_of_pair, place_pair, pose_from_frames, refine_four_points
@@ -35,54 +35,77 @@ def unit_interval(bits):
 
 
 @njit(cache=True, nogil=True)
-def draw_pairs(
-    start, stop, seed, stream, pool, bin_edge, hash_keys, hash_values, bin_starts, means, directions, distance,
-    tolerance, max_tries, first, second,
+def draw_firsts(seed, stream, size, firsts):
+    """Draw the first end of each of K pairs among `size` places in the pool, evenly."""
+    for k in range(firsts.shape[0]):
+        firsts[k] = np.int64(unit_interval(random_bits(seed, stream, 2 * k)) * size)
+
+
+@njit(cache=True, nogil=True)
+def draw_seconds(
+    start, stop, order, firsts, seed, stream, bin_keys, bin_of, hash_keys, hash_values, bin_starts, points, shell,
+    distance, tolerance, max_tries, seconds,
 ):  # fmt: skip
-    """Draw pairs number start … stop: s1 anywhere in the pool, s2 at distance ± tolerance from it.
+    """Draw the second ends of pairs order[start:stop]: evenly among the places at distance ± tolerance from the first.
 
-    pool : (W,) surfels that may be drawn, sorted by the bin of edge `bin_edge` metres they lie in
+    order : (K,) pairs sorted by the bin of their first end; firsts : (K,) its place in the pool
+    points : (W, 3) the pool, sorted by bin; bin_of : (W,) each place's bin; bin_keys : packed coordinates of the bins
     hash_keys, hash_values, bin_starts : packed bin coordinates → bin; where each bin begins in the pool
-    directions : (Q, 3) unit, in random order, Q a power of two; each s1 takes them from a place of its own on
-    first, second : out, surfels of each pair; second is -1 where max_tries tries met none
+    shell : (Q, 3) from a bin to all those that may hold a point at the distance from one in it
+    seconds : (K,) out, a place in the pool; -1 where there is none or max_tries tries met none
 
-    A try looks where a direction leads and takes any surfel of that bin: a hundredth of them lie at the distance, so a
-    pair costs a hundred look-ups in a small table, whatever the size of the site.
+    What the bins of a shell hold is counted once for all pairs that begin in a bin; then one in twenty tries is at the
+    distance. Any direction tried at random met a point in one of two hundred.
     """
-    inverse = 1.0 / bin_edge
     near, far = max(0.0, distance - tolerance) ** 2, (distance + tolerance) ** 2
-    for k in range(start, stop):
-        one = pool[np.int64(unit_interval(random_bits(seed, stream, 2 * k)) * pool.shape[0])]
+    begins, ends = np.empty(shell.shape[0], np.int64), np.empty(shell.shape[0], np.int64)
+    found, last = 0, np.int64(-1)
+    for at in range(start, stop):
+        k = order[at]
+        one = firsts[k]
+        if bin_of[one] != last:
+            last = bin_of[one]
+            cx, cy, cz = unpack_block(bin_keys[last])
+            found, total = 0, np.int64(0)
+            for j in range(shell.shape[0]):
+                there = find_block(
+                    hash_keys, hash_values, pack_block(cx + shell[j, 0], cy + shell[j, 1], cz + shell[j, 2])
+                )
+                if there >= 0:
+                    total += bin_starts[there + 1] - bin_starts[there]
+                    begins[found], ends[found] = bin_starts[there + 1] - total, total
+                    found += 1
+        seconds[k] = -1
+        if found == 0:
+            continue
         bits = random_bits(seed, stream, 2 * k + 1)
-        x, y, z = means[one, 0], means[one, 1], means[one, 2]
-        first[k], second[k] = one, -1
+        x, y, z = points[one, 0], points[one, 1], points[one, 2]
         for _ in range(max_tries):
             bits = bits * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-            way = directions[np.int64(bits >> np.uint64(33)) & (directions.shape[0] - 1)]
-            cx = np.int64(floor((x + distance * way[0]) * inverse))
-            cy = np.int64(floor((y + distance * way[1]) * inverse))
-            cz = np.int64(floor((z + distance * way[2]) * inverse))
-            there = find_block(hash_keys, hash_values, pack_block(cx, cy, cz))
-            if there < 0:
-                continue
-            low = bin_starts[there]
-            bits = bits * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-            two = pool[low + np.int64(unit_interval(bits) * (bin_starts[there + 1] - low))]
-            dx, dy, dz = means[two, 0] - x, means[two, 1] - y, means[two, 2] - z
+            rank = np.int64(unit_interval(bits) * ends[found - 1])
+            low, high = 0, found - 1
+            while low < high:
+                middle = (low + high) >> 1
+                if ends[middle] > rank:
+                    high = middle
+                else:
+                    low = middle + 1
+            two = begins[low] + rank
+            dx, dy, dz = points[two, 0] - x, points[two, 1] - y, points[two, 2] - z
             if near <= dx * dx + dy * dy + dz * dz <= far:
-                second[k] = two
+                seconds[k] = two
                 break
 
 
 @njit(cache=True, nogil=True)
-def count_partners(some, pool, means, distance, tolerance):
-    """How many surfels of the pool lie at distance ± tolerance from some surfels, on average."""
+def count_partners(some, points, distance, tolerance):
+    """How many points (W, 3) lie at distance ± tolerance from some of them, on average."""
     near, far = max(0.0, distance - tolerance) ** 2, (distance + tolerance) ** 2
     total = 0
     for i in range(some.shape[0]):
-        x, y, z = means[some[i], 0], means[some[i], 1], means[some[i], 2]
-        for j in range(pool.shape[0]):
-            dx, dy, dz = means[pool[j], 0] - x, means[pool[j], 1] - y, means[pool[j], 2] - z
+        x, y, z = some[i, 0], some[i, 1], some[i, 2]
+        for j in range(points.shape[0]):
+            dx, dy, dz = points[j, 0] - x, points[j, 1] - y, points[j, 2] - z
             if near <= dx * dx + dy * dy + dz * dz <= far:
                 total += 1
     return total / max(some.shape[0], 1)
@@ -95,16 +118,17 @@ def key_pairs(first, second, signs, means, normals, angle_cell, angle_bins, keys
         keys[k] = -1
         if second[k] < 0:
             continue
-        p, q, a, b = means[first[k]], means[second[k]], normals[first[k]], normals[second[k]]
-        dx, dy, dz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+        p, q = first[k], second[k]
+        dx, dy, dz = means[q, 0] - means[p, 0], means[q, 1] - means[p, 1], means[q, 2] - means[p, 2]
         length = sqrt(dx * dx + dy * dy + dz * dz)
         if length <= 0.0:
             continue
         dx, dy, dz = dx / length, dy / length, dz / length
         sa, sb = 1.0 - 2.0 * (signs[k] & 1), 1.0 - (signs[k] & 2)
-        f1 = angle_between(sa * a[0], sa * a[1], sa * a[2], dx, dy, dz)
-        f2 = angle_between(sb * b[0], sb * b[1], sb * b[2], dx, dy, dz)
-        f3 = angle_between(sa * a[0], sa * a[1], sa * a[2], sb * b[0], sb * b[1], sb * b[2])
+        ax, ay, az = sa * normals[p, 0], sa * normals[p, 1], sa * normals[p, 2]
+        bx, by, bz = sb * normals[q, 0], sb * normals[q, 1], sb * normals[q, 2]
+        f1, f2 = angle_between(ax, ay, az, dx, dy, dz), angle_between(bx, by, bz, dx, dy, dz)
+        f3 = angle_between(ax, ay, az, bx, by, bz)
         keys[k] = feature_key(f1, f2, f3, angle_cell, angle_bins)
 
 
@@ -219,7 +243,7 @@ def test_pairs(
     start, stop, pair_first, pair_second, pair_signs, pair_keys, means, normals,
     offsets, entry_model, entry_first, entry_second, model_starts, model_points, model_normals, samples,
     length, cell, hash_keys, hash_values, occupied, masks, least_hits, origins,
-    best_support, best_model, best_rotation, best_translation, work,
+    best_support, best_model, best_rotation, best_translation,
 ):  # fmt: skip
     """Test every hypothesis of scene pairs start … stop; keep the best of each pair.
 
@@ -230,7 +254,6 @@ def test_pairs(
     least_hits : (T+1,) Wald's test as a table: after k points fewer hits than least_hits[k] end it
     origins : (K, 3) scanner positions: samples that face none of them are passed over; none: all are tested
     best_support : out, share of hits among the samples tested; 0 where no hypothesis passed
-    work : (2,) out, hypotheses and look-ups
     """
     inverse = 1.0 / cell
     scene, model = np.empty((4, 4)), np.empty((4, 4))
@@ -254,13 +277,11 @@ def test_pairs(
             if length > 0.0:
                 refine_four_points(m1, a1, m2, a2, s1, b1, s2, b2, length, rotation)
             place_pair(m1, a1, m2, a2, s1, b1, s2, b2, length, rotation, translation)
-            work[0] += 1
             hits = tested = 0
             for t in range(n):
                 found = lies_on_scene(
                     samples, base + t, rotation, translation, origins, inverse, hash_keys, hash_values, occupied, masks
                 )  # fmt: skip
-                work[1] += 1
                 if found < 0:
                     continue
                 hits += found

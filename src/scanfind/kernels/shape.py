@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from math import floor, sqrt
+from math import sqrt
 
 import numpy as np
 from numba import njit
 
-from scanfind.kernels.blocks import find_block, pack_block
+from scanfind.kernels.blocks import find_block, pack_block, unpack_block
 from scanfind.kernels.surfels import smallest_eigenvector
 
 
@@ -46,17 +46,19 @@ def bend_of_samples(points, normals, window, bends):
 
 
 @njit(cache=True, nogil=True)
-def look_up_flatness(means, cell, hash_keys, hash_values, block_cells, first_surfel, flatness, found):
-    """The flatness of the coarse cell each of S points lies in, (S,), metres; inf where there is none."""
-    inverse = 1.0 / cell
-    for i in range(means.shape[0]):
-        found[i] = np.inf
-        cx = np.int64(floor(means[i, 0] * inverse))
-        cy = np.int64(floor(means[i, 1] * inverse))
-        cz = np.int64(floor(means[i, 2] * inverse))
-        block = find_block(hash_keys, hash_values, pack_block(cx >> 3, cy >> 3, cz >> 3))
-        if block < 0:
-            continue
-        here = block_cells[block, ((cx & 7) << 6) | ((cy & 7) << 3) | (cz & 7)]
-        if here >= 0:
-            found[i] = flatness[first_surfel[here]]
+def spread_down(levels, block_keys, order, first_cell, cell_locals, hash_keys, hash_values, block_rows, above, found):
+    """Give each cell what the cell `levels` above it in the octree has.
+
+    block_keys, order, first_cell, cell_locals : of the cells; hash_keys, hash_values, block_rows : of those above
+    above : values by row; found : (V,) out
+    """
+    for block in range(order.shape[0]):
+        bx, by, bz = unpack_block(block_keys[order[block]])
+        # Up to three levels above, all of a block's cells lie in one block.
+        higher = find_block(hash_keys, hash_values, pack_block(bx >> levels, by >> levels, bz >> levels))
+        for c in range(first_cell[block], first_cell[block + 1]):
+            local = np.int64(cell_locals[c])
+            x = (((bx << 3) | (local >> 6)) >> levels) & 7
+            y = (((by << 3) | ((local >> 3) & 7)) >> levels) & 7
+            z = (((bz << 3) | (local & 7)) >> levels) & 7
+            found[c] = above[block_rows[higher, (x << 6) | (y << 3) | z]]

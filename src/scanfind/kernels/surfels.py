@@ -47,47 +47,38 @@ def smallest_eigenvector(a00, a01, a02, a11, a12, a22):
 
 
 @njit(cache=True, nogil=True)
-def count_cells(start, stop, blocks, rows, counts):
-    """Occupied cells of blocks start … stop, into counts (B,).
-
-    blocks : (B,) the blocks in order; rows : (blocks, 512) a row of each cell's moments, -1 for an empty one
-    """
+def count_cells(start, stop, order, block_rows, counts):
+    """Occupied cells of blocks order[start:stop], into counts (B,); block_rows : (B, 512), -1 for an empty cell."""
     for block in range(start, stop):
         counts[block] = 0
         for local in range(512):
-            if rows[blocks[block], local] >= 0:
+            if block_rows[order[block], local] >= 0:
                 counts[block] += 1
 
 
 @njit(cache=True, nogil=True)
-def number_cells(
-    start, stop, blocks, rows, first_cell, moments, links, block_cells, cell_locals, cell_rows, totals
-):  # fmt: skip
-    """Number the cells of blocks start … stop and sum their views.
-
-    block_cells : (B, 512) out: number of each cell, -1 for empty; cell_rows : (V,) out: a row of each cell's moments
-    totals : (V, 10) float32 out: n, Σx, Σxxᵀ of each cell, all views together; 40 bytes that the 27 cells around read
-    """
-    views = np.zeros(10, np.int64)
+def number_cells(start, stop, order, block_rows, first_cell, cell_locals, cell_rows):
+    """Note the place and the row of each cell of blocks order[start:stop], block `k` of them from first_cell[k] on."""
     for block in range(start, stop):
         cell = first_cell[block]
         for local in range(512):
-            row = np.int64(rows[blocks[block], local])
-            block_cells[block, local] = -1
-            if row < 0:
-                continue
-            block_cells[block, local] = cell
-            cell_locals[cell] = local
-            cell_rows[cell] = row
-            # Summed as integers first: the views of a cell are chained in the order the points came in.
-            views[:] = 0
-            while row >= 0:
-                for k in range(10):
-                    views[k] += moments[row, k]
-                row = np.int64(links[row, 1])
-            for k in range(10):
-                totals[cell, k] = views[k]
-            cell += 1
+            row = block_rows[order[block], local]
+            if row >= 0:
+                cell_locals[cell], cell_rows[cell] = local, row
+                cell += 1
+
+
+@njit(cache=True, nogil=True)
+def sum_views(moments, links, row, views):
+    """Sum a cell's rows, from `row` on, into views (1, 13).
+
+    As integers: the views of a cell are chained in the order the points came in, on which nothing may depend.
+    """
+    views[:, :] = 0
+    while row >= 0:
+        for k in range(13):
+            views[0, k] += moments[row, k]
+        row = np.int64(links[row, 1])
 
 
 @njit(cache=True, nogil=True)
@@ -118,121 +109,120 @@ def plane_of(pool):
 
 
 @njit(cache=True, nogil=True)
-def fit_surfels(
-    first_block, last_block, block_keys, hash_keys, hash_values, moments, links, block_cells,
-    first_cell, cell_locals, cell_rows, totals, cell, units, min_neighbours,
-    n_sides, means, normals, flatness, points,
+def fit_cells(
+    start, stop, some, first_cell, cell_locals, cell_rows, order, block_keys, hash_keys, hash_values, block_rows,
+    moments, links, cell, units, min_neighbours, n_sides,
 ):  # fmt: skip
-    """Fit one or two surfels in every cell of some blocks.
+    """Fit one or two surfels in each of the cells some[start:stop], numbers in ascending order.
 
+    first_cell, cell_locals, cell_rows : see Cells; order : the blocks in which cells are numbered
     cell : edge, metres; units : offset units a cell
     min_neighbours : occupied cells of the 3×3×3 a normal needs, the cell itself included
-    n_sides : (V,) out: 1, or 2 where the scanners saw both faces of something thin
-    means : (V, 3) out, metres from the grid's offset; normals : (V, 3) out, unit, towards the scanner, zero where there
-        are too few neighbours; flatness : (V,) out, standard deviation across the pooled plane, metres; points : (V,)
-    Returns the second faces, (cells with two, 8): mean, normal, flatness, points, in the order of the cells.
+    n_sides : (len(some),) out: 1, or 2 where the scanners saw both faces of something thin
+    Returns the surfels, (S, 8), in the order of the cells: mean, metres from the grid's offset; normal, unit, towards
+    the scanner, zero where there are too few neighbours; standard deviation across the pooled plane, metres; points.
     """
     unit = cell / units
-    backs, back_count = np.empty((first_cell[last_block] - first_cell[first_block], 8)), 0
+    faces, count = np.empty((2 * (stop - start), 8)), 0
     pool = np.zeros(10)
     side = np.zeros(10)
     around = np.empty(27, np.int64)
-    neighbour_cell = np.empty(27, np.int64)
+    neighbours = np.empty(27, np.int64)
     views = np.zeros((1, 13), np.int64)
-    for block in range(first_block, last_block):
-        bx, by, bz = unpack_block(block_keys[block])
+    rank, last = np.searchsorted(first_cell, some[start], side="right") - 1, np.int64(-1)
+    bx = by = bz = np.int64(0)
+    for at in range(start, stop):
+        c = some[at]
+        while first_cell[rank + 1] <= c:
+            rank += 1
+        if rank != last:
+            last = rank
+            bx, by, bz = unpack_block(block_keys[order[rank]])
+            for k in range(27):
+                key = pack_block(bx + k // 9 - 1, by + k // 3 % 3 - 1, bz + k % 3 - 1)
+                around[k] = find_block(hash_keys, hash_values, key)
+        local = np.int64(cell_locals[c])
+        lx, ly, lz = local >> 6, (local >> 3) & 7, local & 7
+        pool[:] = 0.0
+        occupied = 0
         for k in range(27):
-            key = pack_block(bx + k // 9 - 1, by + k // 3 % 3 - 1, bz + k % 3 - 1)
-            around[k] = block if k == 13 else find_block(hash_keys, hash_values, key)
-        for c in range(first_cell[block], first_cell[block + 1]):
-            local = np.int64(cell_locals[c])
-            lx, ly, lz = local >> 6, (local >> 3) & 7, local & 7
+            ix, iy, iz = lx + k // 9 - 1, ly + k // 3 % 3 - 1, lz + k % 3 - 1
+            other = around[((ix >> 3) + 1) * 9 + ((iy >> 3) + 1) * 3 + (iz >> 3) + 1]
+            neighbours[k] = -1
+            if other < 0:
+                continue
+            row = np.int64(block_rows[other, ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7)])
+            if row < 0:
+                continue
+            neighbours[k] = row
+            occupied += 1
+            ex, ey, ez = (k // 9 - 1) * units, (k // 3 % 3 - 1) * units, (k % 3 - 1) * units
+            if links[row, 1] < 0:
+                add_moved(pool, moments, row, ex, ey, ez)
+            else:
+                sum_views(moments, links, row, views)
+                add_moved(pool, views, 0, ex, ey, ez)
+        nx, ny, nz, low, _, _ = plane_of(pool)
+        cx, cy, cz = ((bx << 3) + lx + 0.5) * cell, ((by << 3) + ly + 0.5) * cell, ((bz << 3) + lz + 0.5) * cell
+
+        # A thin plate scanned from both sides: its views disagree about the side.
+        front = back = np.int64(0)
+        row = np.int64(cell_rows[c])
+        while row >= 0:
+            along = moments[row, 10] * nx + moments[row, 11] * ny + moments[row, 12] * nz
+            if along > 0.0:
+                front += moments[row, 0]
+            elif along < 0.0:
+                back += moments[row, 0]
+            row = np.int64(links[row, 1])
+        sum_views(moments, links, np.int64(cell_rows[c]), views)
+        n = float(views[0, 0])
+        two = occupied >= min_neighbours and min(front, back) >= max(2.0, 0.1 * n)
+        n_sides[at] = 2 if two else 1
+        if not two:
+            sign = -1.0 if views[0, 10] * nx + views[0, 11] * ny + views[0, 12] * nz < 0.0 else 1.0
+            if occupied < min_neighbours:
+                sign = 0.0
+            faces[count, 0], faces[count, 1] = cx + views[0, 1] / n * unit, cy + views[0, 2] / n * unit
+            faces[count, 2] = cz + views[0, 3] / n * unit
+            faces[count, 3], faces[count, 4], faces[count, 5] = sign * nx, sign * ny, sign * nz
+            faces[count, 6], faces[count, 7] = sqrt(max(low, 0.0)) * unit, n
+            count += 1
+            continue
+        for s in range(2):
+            sign = 1.0 - 2.0 * s
+            side[:] = 0.0
             pool[:] = 0.0
             occupied = 0
+            dx = dy = dz = np.int64(0)
             for k in range(27):
-                ix, iy, iz = lx + k // 9 - 1, ly + k // 3 % 3 - 1, lz + k % 3 - 1
-                other = around[((ix >> 3) + 1) * 9 + ((iy >> 3) + 1) * 3 + (iz >> 3) + 1]
-                neighbour_cell[k] = -1
-                if other >= 0:
-                    there = ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7)
-                    found = block_cells[other, there]
-                    neighbour_cell[k] = found
-                    if found >= 0:
-                        occupied += 1
-                        add_moved(
-                            pool, totals, found,
-                            (k // 9 - 1) * units, (k // 3 % 3 - 1) * units, (k % 3 - 1) * units,
-                        )  # fmt: skip
-            nx, ny, nz, low, _, _ = plane_of(pool)
-            cx, cy, cz = ((bx << 3) + lx + 0.5) * cell, ((by << 3) + ly + 0.5) * cell, ((bz << 3) + lz + 0.5) * cell
-
-            # A thin plate scanned from both sides: its views disagree about the side.
-            front = back = dx = dy = dz = np.int64(0)
-            row = np.int64(cell_rows[c])
-            while row >= 0:
-                along = moments[row, 10] * nx + moments[row, 11] * ny + moments[row, 12] * nz
-                if along > 0.0:
-                    front += moments[row, 0]
-                elif along < 0.0:
-                    back += moments[row, 0]
-                dx += moments[row, 10]
-                dy += moments[row, 11]
-                dz += moments[row, 12]
-                row = np.int64(links[row, 1])
-            two = occupied >= min_neighbours and min(front, back) >= max(2.0, 0.1 * totals[c, 0])
-            n_sides[c] = 2 if two else 1
-            if not two:
-                sign = -1.0 if dx * nx + dy * ny + dz * nz < 0.0 else 1.0
-                if occupied < min_neighbours:
-                    sign = 0.0
-                n = totals[c, 0]
-                means[c, 0], means[c, 1] = cx + totals[c, 1] / n * unit, cy + totals[c, 2] / n * unit
-                means[c, 2] = cz + totals[c, 3] / n * unit
-                normals[c, 0], normals[c, 1], normals[c, 2] = sign * nx, sign * ny, sign * nz
-                flatness[c], points[c] = sqrt(max(low, 0.0)) * unit, n
-                continue
-            for s in range(2):
-                sign = 1.0 - 2.0 * s
-                side[:] = 0.0
-                pool[:] = 0.0
-                occupied = 0
-                dx = dy = dz = np.int64(0)
-                for k in range(27):
-                    if neighbour_cell[k] < 0:
-                        continue
-                    views[:, :] = 0
-                    row = np.int64(cell_rows[neighbour_cell[k]])
-                    while row >= 0:
-                        along = moments[row, 10] * nx + moments[row, 11] * ny + moments[row, 12] * nz
-                        if along * sign > 0.0:
-                            for j in range(13):
-                                views[0, j] += moments[row, j]
-                        row = np.int64(links[row, 1])
-                    if views[0, 0] == 0:
-                        continue
-                    occupied += 1
-                    dx += views[0, 10]
-                    dy += views[0, 11]
-                    dz += views[0, 12]
-                    add_moved(
-                        pool, views, 0, (k // 9 - 1) * units, (k // 3 % 3 - 1) * units, (k % 3 - 1) * units
-                    )  # fmt: skip
-                    if k == 13:
-                        add_moved(side, views, 0, 0.0, 0.0, 0.0)
-                mx, my, mz, low = nx, ny, nz, 0.0
-                if occupied >= min_neighbours:
-                    mx, my, mz, low, _, _ = plane_of(pool)
-                flip = -1.0 if dx * mx + dy * my + dz * mz < 0.0 else 1.0
-                n, spread = side[0], sqrt(max(low, 0.0)) * unit
-                x, y, z = cx + side[1] / n * unit, cy + side[2] / n * unit, cz + side[3] / n * unit
-                if s == 0:
-                    means[c, 0], means[c, 1], means[c, 2] = x, y, z
-                    normals[c, 0], normals[c, 1], normals[c, 2] = flip * mx, flip * my, flip * mz
-                    flatness[c], points[c] = spread, n
-                else:
-                    b = back_count
-                    backs[b, 0], backs[b, 1], backs[b, 2] = x, y, z
-                    backs[b, 3], backs[b, 4], backs[b, 5] = flip * mx, flip * my, flip * mz
-                    backs[b, 6], backs[b, 7] = spread, n
-                    back_count += 1
-    return backs[:back_count].copy()
+                views[:, :] = 0
+                row = neighbours[k]
+                while row >= 0:
+                    along = moments[row, 10] * nx + moments[row, 11] * ny + moments[row, 12] * nz
+                    if along * sign > 0.0:
+                        for j in range(13):
+                            views[0, j] += moments[row, j]
+                    row = np.int64(links[row, 1])
+                if views[0, 0] == 0:
+                    continue
+                occupied += 1
+                dx += views[0, 10]
+                dy += views[0, 11]
+                dz += views[0, 12]
+                add_moved(
+                    pool, views, 0, (k // 9 - 1) * units, (k // 3 % 3 - 1) * units, (k % 3 - 1) * units
+                )  # fmt: skip
+                if k == 13:
+                    add_moved(side, views, 0, 0.0, 0.0, 0.0)
+            mx, my, mz, low = nx, ny, nz, 0.0
+            if occupied >= min_neighbours:
+                mx, my, mz, low, _, _ = plane_of(pool)
+            flip = -1.0 if dx * mx + dy * my + dz * mz < 0.0 else 1.0
+            n = side[0]
+            faces[count, 0], faces[count, 1] = cx + side[1] / n * unit, cy + side[2] / n * unit
+            faces[count, 2] = cz + side[3] / n * unit
+            faces[count, 3], faces[count, 4], faces[count, 5] = flip * mx, flip * my, flip * mz
+            faces[count, 6], faces[count, 7] = sqrt(max(low, 0.0)) * unit, n
+            count += 1
+    return faces[:count]
