@@ -1,0 +1,75 @@
+"""Where to stand: free places for a scanner, and of them the few that together see most of what is looked for."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.errors import UsageError
+from scanfind.simulate.placement import Occupancy, sample_points
+from scanfind.simulate.scene import Scene
+
+Floats = NDArray[np.float64]
+
+SCANNER_HEIGHT_M = 1.6
+# Outside the box frame, whose inside is nowhere farther from a member.
+SCANNER_NEAR_M = 1.1
+# The least share of a target's surface that the stations together must see.
+LEAST_VISIBLE = 0.3
+# Candidates tried, and points of each target's surface they are judged by: shares within 2 %.
+SPOTS, SAMPLES = 80, 1500
+
+
+def scanner_fits(room: Occupancy, foot: Floats) -> bool:
+    """Whether a scanner on its tripod, 0.6 m across and 1.9 m high, stands free with its middle at `foot` (3,)."""
+    sides = [-0.3, 0.0, 0.3]
+    body = np.stack(np.meshgrid(sides, sides, np.arange(0.05, 1.9, 0.1)), axis=-1).reshape(-1, 3)
+    return room.fits(foot + body)
+
+
+def free_spots(room: Occupancy, floors: tuple[float, ...], rng: np.random.Generator, count: int = SPOTS) -> Floats:
+    """Up to `count` places (M, 3) where a scanner's eye could be, spread over a room's floors."""
+    low, high = room.corner[:2] + 0.4, room.corner[:2] + room.size[:2] - 0.4
+    found = []
+    for _ in range(20 * count):
+        foot = np.array([*rng.uniform(np.minimum(low, high), high), float(rng.choice(floors))])
+        if scanner_fits(room, foot):
+            found.append(foot + [0.0, 0.0, SCANNER_HEIGHT_M + rng.uniform(-0.1, 0.1)])
+        if len(found) == count:
+            break
+    return np.array(found).reshape(-1, 3)
+
+
+def best_stations(scene: Scene, spots: Floats, count: int) -> tuple[Floats, Floats]:
+    """`count` of the places (M, 3), one after the other that which adds most, and what they see: (count, 3), (targets,).
+
+    What counts is the share of each target's surface in sight from any station, twice as much while it is below
+    a half: no target may be left out for the sake of another. Where there is no target, everything is one.
+    """
+    if not 1 <= count <= len(spots):
+        msg = f"there is free room for {len(spots)} stations, got {count}: give positions of your own, or fewer"
+        raise UsageError(msg)
+    caster = scene.caster()
+    ids = scene.target_ids() or range(len(scene.objects))
+    surfaces = [
+        scene.objects[k].pose.move(sample_points(scene.objects[k].mesh, np.random.default_rng(k), SAMPLES)) for k in ids
+    ]
+    every = np.concatenate(surfaces)
+    ends = np.cumsum([len(surface) for surface in surfaces])[:-1]
+    sees = np.array([caster.sees(at, every) & (np.linalg.norm(every - at, axis=1) > SCANNER_NEAR_M) for at in spots])
+
+    def shares(seen: NDArray[np.bool_]) -> Floats:
+        return np.array([part.mean() for part in np.split(seen, ends)])
+
+    def worth(seen: NDArray[np.bool_]) -> float:
+        share = shares(seen)
+        return float(np.sum(share + np.minimum(share, 0.5)))
+
+    chosen: list[int] = []
+    so_far = np.zeros(len(every), dtype=bool)
+    for _ in range(count):
+        left = [k for k in range(len(spots)) if k not in chosen]
+        best = max(left, key=lambda k: worth(so_far | sees[k]))
+        chosen.append(best)
+        so_far |= sees[best]
+    return spots[chosen], shares(so_far)
