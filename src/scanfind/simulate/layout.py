@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,21 @@ from scanfind.simulate.placement import Occupancy, surface_points
 from scanfind.simulate.scene import SceneObject
 
 Floats = NDArray[np.float64]
+Choice = TypeVar("Choice")
 
 WALL_GAP_M = 0.1
 # Lower than this, a thing may lie on something high; a taller one would be a hazard up there.
 LOW_M = 1.2
 TIMBER_M, SAW_HORSE_M = 0.1, 0.75
 TRIES = 400
+
+
+class Floor(NamedTuple):
+    """What things may stand on: its height, and the corners (x, y) it lies between, metres."""
+
+    height: float
+    low: tuple[float, float]
+    high: tuple[float, float]
 
 
 class Layout:
@@ -30,7 +40,7 @@ class Layout:
 
     size : the room things may stand in, from (0, 0, 0) on, metres
     background : object 0, of which nothing takes room
-    floors : heights that things may stand on
+    decks : floors above the ground that things may stand on as well
     high : heights of supports for what is low enough to lie there
     """
 
@@ -39,12 +49,13 @@ class Layout:
         seed: Sequence[int],
         size: tuple[float, float, float],
         background: Mesh,
-        floors: Sequence[float] = (0.0,),
+        decks: Sequence[Floor] = (),
         high: Sequence[float] = (SAW_HORSE_M,),
     ) -> None:
         purposes = ("target", "furniture", "spools", "stations", "paint")
         self.rngs = {purpose: np.random.default_rng([*seed, k]) for k, purpose in enumerate(purposes)}
-        self.size, self.floors, self.high = size, floors, high
+        self.floors = [Floor(0.0, (0.0, 0.0), size[:2]), *decks]
+        self.high = high
         self.room = Occupancy(size)
         self._spread: dict[Mesh, Floats] = {}
         self.objects = [SceneObject(background.name, background, Pose.identity(), 0.6)]
@@ -90,12 +101,13 @@ class Layout:
         low, size = turned.min(axis=0), np.ptp(turned, axis=0)
         height = 0.0
         if lying:
-            height = self._high(rng) if size[2] < LOW_M and rng.random() < 0.5 else TIMBER_M
-        height += _one_of(self.floors, rng)
-        room = np.maximum(np.array(self.size[:2]) - WALL_GAP_M - size[:2], WALL_GAP_M)
-        corner = np.array([*rng.uniform([WALL_GAP_M, WALL_GAP_M], room), height])
+            height = _one_of(self.high, rng) if size[2] < LOW_M and rng.random() < 0.5 else TIMBER_M
+        floor = _one_of(self.floors, rng)
+        first, last = _corners(floor, size)
+        corner = np.array([*rng.uniform(first, last), floor.height + height])
         thing = self.painted(mesh.name, mesh, at(*(corner - low)) @ turn, target)
-        return self.put([thing, *(self._supports(turned + (corner - low), height) if lying else [])])
+        things = [thing, *(self._supports(turned + (corner - low), floor.height, height) if lying else [])]
+        return bool((corner[:2] + size[:2] <= floor.high).all()) and self.put(things)
 
     def stand(self, mesh: Mesh, rng: np.random.Generator, at_wall: bool = False) -> None:
         """Stand a mesh anywhere on the floor, or with its long side along a wall, if there is room."""
@@ -103,24 +115,21 @@ class Layout:
             turn = yaw(float(rng.integers(4)) * np.pi / 2 if at_wall else rng.uniform(0, 2 * np.pi))
             turned = turn.move(mesh.vertices)
             low, size = turned.min(axis=0), np.ptp(turned, axis=0)
-            room = np.maximum(np.array(self.size[:2]) - WALL_GAP_M - size[:2], WALL_GAP_M)
-            corner = rng.uniform([WALL_GAP_M, WALL_GAP_M], room)
+            floor = _one_of(self.floors, rng)
+            first, last = _corners(floor, size)
+            corner = rng.uniform(first, last)
             if at_wall:
                 short = int(np.argmin(size[:2]))
-                corner[short] = (WALL_GAP_M, room[short])[int(rng.integers(2))]
-            if self.put([self.painted(mesh.name, mesh, at(*(corner - low[:2]), _one_of(self.floors, rng)) @ turn)]):
+                corner[short] = (first[short], last[short])[int(rng.integers(2))]
+            thing = self.painted(mesh.name, mesh, at(*(corner - low[:2]), floor.height) @ turn)
+            if (corner + size[:2] <= floor.high).all() and self.put([thing]):
                 return
 
-    def _high(self, rng: np.random.Generator) -> float:
-        return _one_of(self.high, rng)
-
-    def _supports(self, vertices: Floats, height: float) -> list[SceneObject]:
-        """Timber, saw horses or goalposts under the lowest parts of something whose vertices (V, 3) are at `height`."""
-        bottom = vertices[vertices[:, 2] < height + 0.02][:, :2]
+    def _supports(self, vertices: Floats, floor: float, tall: float) -> list[SceneObject]:
+        """Timber, saw horses or goalposts under the lowest parts of vertices (V, 3) that begin `tall` above a floor."""
+        bottom = vertices[vertices[:, 2] < floor + tall + 0.02][:, :2]
         way = np.linalg.svd(bottom - bottom.mean(axis=0), full_matrices=False)[2][0]
         along = bottom @ way
-        floor = max(level for level in self.floors if level < height)
-        tall = height - floor
         supports = []
         # One under the middle where there is no length to speak of: a spool on its end.
         for share in (0.12, 0.88) if np.ptp(along) > 0.6 else (0.5,):
@@ -146,8 +155,15 @@ def yaw(angle: float) -> Pose:
     return Pose.from_rotation_vector([0.0, 0.0, angle])
 
 
-def _one_of(heights: Sequence[float], rng: np.random.Generator) -> float:
-    return heights[0] if len(heights) == 1 else float(rng.choice(heights))
+def _corners(floor: Floor, size: Floats) -> tuple[Floats, Floats]:
+    """Between which (2,) the low corner of something of this size (3,) may lie."""
+    first = np.array(floor.low) + WALL_GAP_M
+    return first, np.maximum(np.array(floor.high) - WALL_GAP_M - size[:2], first)
+
+
+def _one_of(choices: Sequence[Choice], rng: np.random.Generator) -> Choice:
+    """Any of them; where there is one only, without a throw."""
+    return choices[0] if len(choices) == 1 else choices[int(rng.integers(len(choices)))]
 
 
 def _any_side(rng: np.random.Generator) -> Pose:

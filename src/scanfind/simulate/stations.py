@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.errors import UsageError
+from scanfind.simulate.layout import Floor
 from scanfind.simulate.placement import Occupancy, sample_points
 from scanfind.simulate.scene import Scene
 
@@ -27,12 +30,12 @@ def scanner_fits(room: Occupancy, foot: Floats) -> bool:
     return room.fits(foot + body)
 
 
-def free_spots(room: Occupancy, floors: tuple[float, ...], rng: np.random.Generator, count: int = SPOTS) -> Floats:
+def free_spots(room: Occupancy, floors: Sequence[Floor], rng: np.random.Generator, count: int = SPOTS) -> Floats:
     """Up to `count` places (M, 3) where a scanner's eye could be, spread over a room's floors."""
-    low, high = room.corner[:2] + 0.4, room.corner[:2] + room.size[:2] - 0.4
     found = []
     for _ in range(20 * count):
-        foot = np.array([*rng.uniform(np.minimum(low, high), high), float(rng.choice(floors))])
+        floor = floors[int(rng.integers(len(floors)))]
+        foot = np.array([*rng.uniform(floor.low, floor.high), floor.height])
         if scanner_fits(room, foot):
             found.append(foot + [0.0, 0.0, SCANNER_HEIGHT_M + rng.uniform(-0.1, 0.1)])
         if len(found) == count:
@@ -44,16 +47,21 @@ def best_stations(scene: Scene, spots: Floats, count: int) -> tuple[Floats, Floa
     """`count` of the places (M, 3), one after the other that which adds most, and what they see: (count, 3), (targets,).
 
     What counts is the share of each target's surface in sight from any station, twice as much while it is below
-    a half: no target may be left out for the sake of another. Where there is no target, everything is one.
+    a half, lest one be left out for the sake of another; and, as one more target, all the rest but the background.
     """
     if not 1 <= count <= len(spots):
         msg = f"there is free room for {len(spots)} stations, got {count}: give positions of your own, or fewer"
         raise UsageError(msg)
     caster = scene.caster()
-    ids = scene.target_ids() or range(len(scene.objects))
-    surfaces = [
-        scene.objects[k].pose.move(sample_points(scene.objects[k].mesh, np.random.default_rng(k), SAMPLES)) for k in ids
-    ]
+
+    def surface(k: int, points: int) -> Floats:
+        thing = scene.objects[k]
+        return thing.pose.move(sample_points(thing.mesh, np.random.default_rng(k), points))
+
+    ids = scene.target_ids()
+    rest = [k for k in range(1, len(scene.objects)) if k not in ids] or [0]
+    surfaces = [surface(k, SAMPLES) for k in ids]
+    surfaces.append(np.concatenate([surface(k, max(1, 2 * SAMPLES // len(rest))) for k in rest]))
     every = np.concatenate(surfaces)
     ends = np.cumsum([len(surface) for surface in surfaces])[:-1]
     sees = np.array([caster.sees(at, every) & (np.linalg.norm(every - at, axis=1) > SCANNER_NEAR_M) for at in spots])
@@ -72,4 +80,4 @@ def best_stations(scene: Scene, spots: Floats, count: int) -> tuple[Floats, Floa
         best = max(left, key=lambda k: worth(so_far | sees[k]))
         chosen.append(best)
         so_far |= sees[best]
-    return spots[chosen], shares(so_far)
+    return spots[chosen], shares(so_far)[: len(ids)]
