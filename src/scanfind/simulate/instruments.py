@@ -178,38 +178,38 @@ class Scanner(Instrument):
 
 @dataclass(frozen=True)
 class FrameSensor(Instrument):
-    """A structured-light sensor: a camera's raster of width x height radians, and a projector `baseline` m beside it.
+    """A structured-light sensor: a camera's raster of view_width x view_height radians, and a projector `baseline` m beside it.
 
     Pixels are even on the image plane. Where the projector's light does not fall, nothing is measured.
     """
 
-    width: float = float(np.radians(57.0))
-    height: float = float(np.radians(43.0))
+    view_width: float = float(np.radians(57.0))
+    view_height: float = float(np.radians(43.0))
     baseline: float = 0.075
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (0.0 < self.width < 3.0 and 0.0 < self.height < 3.0 and 0.0 <= self.baseline < 10.0):
-            view = f"{np.degrees(self.width):.1f} x {np.degrees(self.height):.1f}"
+        if not (0.0 < self.view_width < 3.0 and 0.0 < self.view_height < 3.0 and 0.0 <= self.baseline < 10.0):
+            view = f"{np.degrees(self.view_width):.1f} x {np.degrees(self.view_height):.1f}"
             msg = f"a frame sensor needs a view of 0 to 170 degrees and a baseline, got {view} and {self.baseline} m"
             raise UsageError(msg)
 
     def rows(self) -> int:
         """How many pixels the image is high."""
-        return max(2, round(2 * np.tan(self.height / 2) / self.step) + 1)
+        return max(2, round(2 * np.tan(self.view_height / 2) / self.step) + 1)
 
     def columns(self) -> int:
         """How many pixels the image is wide."""
-        return max(2, round(2 * np.tan(self.width / 2) / self.step) + 1)
+        return max(2, round(2 * np.tan(self.view_width / 2) / self.step) + 1)
 
     def area(self) -> float:
         """That of the image plane at 1 m."""
-        return float(4 * np.tan(self.width / 2) * np.tan(self.height / 2))
+        return float(4 * np.tan(self.view_width / 2) * np.tan(self.view_height / 2))
 
     def directions(self, row: ArrayLike, column: ArrayLike) -> Floats:
         """Unit directions (N, 3): row 0 lowest, column 0 leftmost (+y)."""
-        left = np.tan(self.width / 2) * (1 - 2 * np.asarray(column) / (self.columns() - 1))
-        up = np.tan(self.height / 2) * (2 * np.asarray(row) / (self.rows() - 1) - 1)
+        left = np.tan(self.view_width / 2) * (1 - 2 * np.asarray(column) / (self.columns() - 1))
+        up = np.tan(self.view_height / 2) * (2 * np.asarray(row) / (self.rows() - 1) - 1)
         rays = np.stack([np.ones_like(left), left, up], axis=-1)
         unit: Floats = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         return unit
@@ -217,8 +217,8 @@ class FrameSensor(Instrument):
     def in_view(self, directions: Floats) -> Mask:
         """Whether the image shows it."""
         ahead, left, up = directions.T
-        shown: Mask = np.abs(left) <= np.tan(self.width / 2) * ahead
-        return shown & (np.abs(up) <= np.tan(self.height / 2) * ahead)
+        shown: Mask = np.abs(left) <= np.tan(self.view_width / 2) * ahead
+        return shown & (np.abs(up) <= np.tan(self.view_height / 2) * ahead)
 
     def placed(self, position: Floats, look_at: Floats) -> Pose:
         """Looking at `look_at`, upright."""

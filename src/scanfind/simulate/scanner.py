@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +19,7 @@ from scanfind.simulate.instruments import Instrument, Scanner
 from scanfind.simulate.rays import RayCaster
 from scanfind.simulate.scene import BACKGROUND, Scene
 
-__all__ = ["Scanner", "SimulatedScan", "Survey", "scan", "shares"]
+__all__ = ["Block", "Scanner", "SimulatedScan", "Survey", "scan", "shares"]
 
 Floats = NDArray[np.float64]
 
@@ -56,6 +57,14 @@ class SimulatedScan:
     def points_on(self, object_id: int) -> Floats:
         """(N, 3): every scanned point of one object, from all stations."""
         return np.concatenate([s.xyz[s.attributes["object_id"] == object_id] for s in self.stations])
+
+
+class Block(NamedTuple):
+    """Some points of one station, and how many beams were sent out for them."""
+
+    station: int
+    beams: int
+    cloud: PointCloud
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,14 +106,14 @@ class Survey:
         """How many beams all stations send out."""
         return self.scanner.rows() * self.scanner.columns() * len(self.poses)
 
-    def blocks(self, threads: int) -> Iterator[tuple[int, PointCloud]]:
-        """(station, some of its points), station by station, columns in order; the same for any number of threads.
+    def blocks(self, threads: int) -> Iterator[Block]:
+        """All points, station by station, columns in order; the same for any number of threads.
 
         Only a few blocks wait to be taken, however slow the taker is.
         """
         columns = max(1, BLOCK_RAYS // self.scanner.rows())
         work = [(k, first) for k in range(len(self.poses)) for first in range(0, self.scanner.columns(), columns)]
-        pool, waiting = ThreadPoolExecutor(max(1, threads)), deque[Future[tuple[int, PointCloud]]]()
+        pool, waiting = ThreadPoolExecutor(max(1, threads)), deque[Future[Block]]()
         try:
             for station, first in work:
                 waiting.append(pool.submit(self._block, station, columns, first))
@@ -115,7 +124,7 @@ class Survey:
         finally:
             pool.shutdown(cancel_futures=True)
 
-    def _block(self, station: int, columns: int, first: int) -> tuple[int, PointCloud]:
+    def _block(self, station: int, columns: int, first: int) -> Block:
         """Scan `columns` columns from `first` on: at most columns x rows points."""
         rng = np.random.default_rng([self.seed, station, first])
         scanner, pose = self.scanner, self.poses[station]
@@ -149,11 +158,12 @@ class Survey:
             "object_id": np.where(mixed > 0, BACKGROUND, owner[kept]),
             "mixed": mixed,
         }
-        return station, PointCloud(
+        cloud = PointCloud(
             pose.translation + directions[kept] * measured[:, None],
             {name: attributes[name].astype(dtype) for name, dtype in self.fields().items()},
             pose.translation if scanner.has_stations else None,
         )
+        return Block(station, len(row), cloud)
 
     def fields(self) -> dict[str, np.dtype[np.generic]]:
         """The attributes its points have; what has no stations has no raster either."""
@@ -202,8 +212,8 @@ def scan(
     """
     survey = Survey.of(scene, stations, scanner, seed, points)
     blocks: list[list[PointCloud]] = [[] for _ in survey.poses]
-    for station, block in survey.blocks(threads):
-        blocks[station].append(block)
+    for block in survey.blocks(threads):
+        blocks[block.station].append(block.cloud)
     clouds = [_joined(parts) for parts in blocks]
     return SimulatedScan(clouds, survey.scanner, scene.truth(), tuple(thing.name for thing in scene.objects))
 
@@ -234,7 +244,7 @@ def _step_for(points: int, survey: Survey) -> float:
     area = survey.scanner.area()
     pilot = survey.with_step(min(0.5, max(survey.scanner.finest, float(np.sqrt(area / PILOT_RAYS)))))
     shots = map(partial(pilot._block, columns=pilot.scanner.columns(), first=0), range(len(pilot.poses)))
-    share = sum(len(cloud) for _, cloud in shots) / pilot.beams()
+    share = sum(len(block.cloud) for block in shots) / pilot.beams()
     if share == 0.0:
         msg = "no beam comes back: the stations see nothing of the scene within the scanner's range"
         raise UsageError(msg)
