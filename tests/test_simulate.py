@@ -353,8 +353,9 @@ def test_wrong_calls_say_so(spool_shop: Scene, spool: Mesh) -> None:
 
 @pytest.mark.parametrize("suffix", ["ply", "laz"])
 def test_a_written_scan_reads_back_with_its_truth(spool_scan: SimulatedScan, tmp_path: Path, suffix: str) -> None:
-    from scanfind.scans import read_scan
     from scanfind.simulate.write import write_scan
+
+    from scanfind.scans import read_scan
 
     paths = write_scan(spool_scan, tmp_path / "shop", suffix)
     truth = json.loads((tmp_path / "shop" / "truth.json").read_text())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from scanfind.cli.options import Count, Flag, Metres, Paths, Position, Units, note, say
+from scanfind.cli.options import Count, Flag, Metres, Paths, Units, note, say
 from scanfind.errors import UsageError
 
 if TYPE_CHECKING:
@@ -112,9 +112,7 @@ def simulate(
         "noise": noise,
         **dict(zip(("nearest", "farthest"), _numbers(range, 2, "--range MIN,MAX"), strict=False)),
     }
-    device = replace(
-        _preset(scanner) or device, **{key: value for key, value in changes.items() if value is not None}
-    )
+    device = replace(_preset(scanner) or device, **{key: value for key, value in changes.items() if value is not None})
     if points is not None:
         wanted = _whole(points)
     elif step is not None:

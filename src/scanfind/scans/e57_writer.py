@@ -49,6 +49,8 @@ class Writer(CloudFile):
 
         self.part.open("wb").close()
         self._in_scan = False
+        self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
+        self._darkest, self._brightest = np.inf, -np.inf
         with _failing_as_os_error():
             self._image = libe57.ImageFile(str(self.part), "w")
             self._scans = self._headers()
@@ -212,7 +214,7 @@ def _memory(dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 
 def _elements(names: Iterable[str], named: Mapping[str, str]) -> dict[str, str]:
-    """Attribute name → element name, as `named` has it; those E57 does not know go to our extension, spelled as XML allows."""
+    """Attribute name → element name: as `named` has it, else in our extension, spelled as XML allows."""
     elements: dict[str, str] = {}
     for name in names:
         spelled = re.sub(r"[^A-Za-z0-9_]", "_", name)

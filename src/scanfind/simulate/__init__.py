@@ -1,9 +1,9 @@
 """A virtual laser scanner, and scenes to try it on.
 
-    from scanfind.simulate import SCANNERS, plant, simulate
+from scanfind.simulate import SCANNERS, plant, simulate
 
-    simulate(plant(seed=7), "sim", scanner=SCANNERS["phase"], points=2_000_000)
-    simulate(plant(seed=7), scanner=SCANNERS["phase"]).targets()    # writes nothing: what would be seen?
+simulate(plant(seed=7), "sim", scanner=SCANNERS["phase"], points=2_000_000)
+simulate(plant(seed=7), scanner=SCANNERS["phase"]).targets()    # writes nothing: what would be seen?
 """
 
 from scanfind.simulate.building import frame

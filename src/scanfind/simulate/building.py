@@ -16,6 +16,7 @@ from scanfind.simulate.parts import assemble, blocks
 from scanfind.simulate.scene import Scene
 from scanfind.simulate.stations import LEAST_VISIBLE, best_stations, free_spots
 from scanfind.simulate.steel import along, hollow_beam, i_beam
+import itertools
 
 FRAME_M = (22.0, 14.0, 8.4)
 GRID_X_M, GRID_Y_M = (2.0, 8.0, 14.0, 20.0), (2.5, 7.0, 11.5)
@@ -75,13 +76,13 @@ def _structure() -> Iterator[tuple[Mesh, Pose]]:
     for top in LEVELS_M:
         z = top - BEAM_M[1] / 2
         for y in GRID_Y_M:
-            for a, b in zip(GRID_X_M[:-1], GRID_X_M[1:], strict=True):
+            for a, b in itertools.pairwise(GRID_X_M):
                 yield _named("beam", i_beam([a + half, y, z], [b - half, y, z], *BEAM_M))
-        for c, d in zip(GRID_Y_M[:-1], GRID_Y_M[1:], strict=True):
+        for c, d in itertools.pairwise(GRID_Y_M):
             for x in GRID_X_M:
                 yield _named("beam", i_beam([x, c + half, z], [x, d - half, z], *BEAM_M))
             ends = c + BEAM_M[0] / 2 + 0.01, d - BEAM_M[0] / 2 - 0.01
-            for a, b in zip(GRID_X_M[:-1], GRID_X_M[1:], strict=True):
+            for a, b in itertools.pairwise(GRID_X_M):
                 for x in np.linspace(a, b, 4)[1:-1]:
                     level = top - JOIST_M[1] / 2
                     yield _named("joist", i_beam([x, ends[0], level], [x, ends[1], level], *JOIST_M))
@@ -110,12 +111,11 @@ def _deck() -> Mesh:
     low, open_ = LEVELS_M[0], 0.17
     x_end = GRID_X_M[DECKED] + 0.2
     strips = [
-        ((GRID_X_M[0] - 0.2, c + open_, low), (x_end, d - open_, DECK_M))
-        for c, d in zip(GRID_Y_M[:-1], GRID_Y_M[1:], strict=True)
+        ((GRID_X_M[0] - 0.2, c + open_, low), (x_end, d - open_, DECK_M)) for c, d in itertools.pairwise(GRID_Y_M)
     ]
     strips += [
         ((a + open_, GRID_Y_M[0] - 0.2, low), (b - open_, GRID_Y_M[-1] + 0.2, DECK_M))
-        for a, b in zip(GRID_X_M[:DECKED], GRID_X_M[1 : DECKED + 1], strict=True)
+        for a, b in itertools.pairwise(GRID_X_M)
     ]
     return blocks("deck", strips)
 
@@ -155,7 +155,9 @@ def _stack(rng: np.random.Generator) -> Mesh:
     length, width, depth = float(rng.uniform(2.0, 5.0)), 0.15, float(rng.choice([0.15, 0.2, 0.3]))
     count = int(rng.integers(2, 6))
     across = (np.arange(count) - (count - 1) / 2) * (width + 0.03)
-    timber = [((u - 0.05, across[0] - 0.2, 0.0), (u + 0.05, across[-1] + 0.2, 0.1)) for u in (-0.3 * length, 0.3 * length)]
+    timber = [
+        ((u - 0.05, across[0] - 0.2, 0.0), (u + 0.05, across[-1] + 0.2, 0.1)) for u in (-0.3 * length, 0.3 * length)
+    ]
     beams = [
         i_beam([-length / 2 + s, y, 0.1 + depth / 2], [length / 2 + s, y, 0.1 + depth / 2], width, depth)
         for y, s in zip(across, rng.uniform(-0.1, 0.1, count), strict=True)

@@ -51,7 +51,11 @@ def valve(radius: float) -> tuple[Mesh, float]:
     def out(x: float) -> Pose:
         return axis @ Pose(np.eye(3), np.array([0.0, 0.0, x]))
 
-    placed = [(body, Pose.identity()), (cylinder(0.6 * r, 1.8 * r), out(r)), (cylinder(0.15 * r, 1.9 * r), out(2.8 * r))]
+    placed = [
+        (body, Pose.identity()),
+        (cylinder(0.6 * r, 1.8 * r), out(r)),
+        (cylinder(0.15 * r, 1.9 * r), out(2.8 * r)),
+    ]
     placed += [(wheel, out(4.5 * r)), (blocks("spokes", spokes), out(4.5 * r))]
     return assemble("valve", placed), length
 
@@ -116,7 +120,10 @@ def drum_vessel(radius: float, length: float, axis: float, inlet_radius: float) 
 def pump(height: float, inlet_radius: float) -> Mesh:
     """A pump with its motor on a plinth, away along +y from its inlet's flange face at the origin, `height` up."""
     plinth = max(0.1, height - 0.35)
-    steel = [((-0.3, 0.15, -height), (0.3, 1.45, plinth - height)), ((-0.15, 0.85, plinth - height), (0.15, 1.3, -0.12))]
+    steel = [
+        ((-0.3, 0.15, -height), (0.3, 1.45, plinth - height)),
+        ((-0.15, 0.85, plinth - height), (0.15, 1.3, -0.12)),
+    ]
     volute = Pose(TOWARDS_Y.rotation, np.array([0.0, 0.2, 0.0]))
     motor = Pose(TOWARDS_Y.rotation, np.array([0.0, 0.75, 0.0]))
     shaft = Pose(TOWARDS_Y.rotation, np.array([0.0, 0.3, 0.0]))

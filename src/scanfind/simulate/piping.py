@@ -19,6 +19,7 @@ from scanfind.simulate.parts import assemble, blocks
 from scanfind.simulate.scene import Scene
 from scanfind.simulate.stations import LEAST_VISIBLE, best_stations, free_spots
 from scanfind.simulate.steel import hollow_beam, i_beam
+import itertools
 
 Floats = NDArray[np.float64]
 
@@ -106,7 +107,7 @@ def _rack() -> Iterator[tuple[Mesh, Pose]]:
             yield furniture.column(TIERS_M[-1] + 0.3), at(x, y)
         for z in TIERS_M:
             yield _named("beam", i_beam([x, RACK_Y_M[0] + 0.12, z - 0.1], [x, RACK_Y_M[1] - 0.12, z - 0.1], 0.15, 0.2))
-    for a, b in zip(BENTS_M[:-1], BENTS_M[1:], strict=True):
+    for a, b in itertools.pairwise(BENTS_M):
         for y in RACK_Y_M:
             yield _named("strut", i_beam([a + 0.12, y, 3.75], [b - 0.12, y, 3.75], 0.12, 0.16))
             if a in (BENTS_M[0], BENTS_M[-2]):

@@ -17,9 +17,7 @@ POINTS_PER_M2 = 900.0
 class Occupancy:
     """A room's voxels, `size` metres from `corner` on; nothing is in it at first."""
 
-    def __init__(
-        self, size: tuple[float, float, float], corner: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    ) -> None:
+    def __init__(self, size: tuple[float, float, float], corner: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
         self.size, self.corner = np.array(size), np.array(corner)
         self._taken = np.zeros(np.ceil(self.size / VOXEL_M).astype(int), dtype=bool)
 

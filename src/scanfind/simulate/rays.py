@@ -77,9 +77,7 @@ class RayCaster:
         height, turn = 1 - 2 * k / 1000, np.pi * (1 + 5**0.5) * k  # a spiral, evenly over the sphere
         level = np.sqrt(1 - height**2)
         ways = np.stack([level * np.cos(turn), level * np.sin(turn), height], axis=1)
-        found = self._scene.run(
-            np.tile(point, (1000, 1)).astype(np.float32), ways.astype(np.float32), output=1
-        )
+        found = self._scene.run(np.tile(point, (1000, 1)).astype(np.float32), ways.astype(np.float32), output=1)
         hit = found["primID"] >= 0
         if not hit.any():
             return float("inf"), 0.0

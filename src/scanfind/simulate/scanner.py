@@ -233,7 +233,9 @@ def shares(caster: RayCaster, stations: Floats, scanner: Scanner) -> Floats:
 def _joined(parts: Sequence[PointCloud]) -> PointCloud:
     attributes = {name: np.concatenate([part.attributes[name] for part in parts]) for name in parts[0].attributes}
     origin = parts[0].origin
-    return PointCloud(np.concatenate([part.xyz for part in parts]), attributes, None if origin is None else origin.copy())
+    return PointCloud(
+        np.concatenate([part.xyz for part in parts]), attributes, None if origin is None else origin.copy()
+    )
 
 
 def _step_for(points: int, survey: Survey) -> float:

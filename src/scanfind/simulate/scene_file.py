@@ -175,7 +175,10 @@ def read_scene(path: str | Path) -> SceneFile:
     scene = Scene((_background(around), *things), np.zeros((0, 3)))
     scanner, points = _scanner(scanner_table, f"{path}: scanner")
     if stations:
-        read = [_read(_Station, values, f"{path}: station {k}", _keys(_Station), ("position",)) for k, values in enumerate(stations, 1)]
+        read = [
+            _read(_Station, values, f"{path}: station {k}", _keys(_Station), ("position",))
+            for k, values in enumerate(stations, 1)
+        ]
         scene = _with(scene, read)
     else:
         scene = with_best_stations(scene, top.stations or 1, top.seed)
@@ -264,7 +267,9 @@ def _part(name: str, sizes: Mapping[str, Any], where: str) -> Mesh:
             msg = f"{where}: {key}: must be a finite number, got {value!r}"
             raise UsageError(msg)
         given[spelled[key]] = float(np.radians(number)) if spelled[key] in ANGLES else number
-    missing = [word for word, key in spelled.items() if key not in given and arguments[key].default is inspect.Parameter.empty]
+    missing = [
+        word for word, key in spelled.items() if key not in given and arguments[key].default is inspect.Parameter.empty
+    ]
     if missing:
         msg = f"{where}: a {name} needs {', '.join(missing)}"
         raise UsageError(msg)
@@ -345,7 +350,9 @@ def _tables(tables: dict[str, Any], key: str, path: Path) -> list[Mapping[str, A
     return [_table(entry, path, f"[[{key}]]") for entry in listed]
 
 
-def _read(kind: type[T], values: Mapping[str, Any], where: str, known: tuple[str, ...], needed: tuple[str, ...] = ()) -> T:
+def _read(
+    kind: type[T], values: Mapping[str, Any], where: str, known: tuple[str, ...], needed: tuple[str, ...] = ()
+) -> T:
     """A dataclass filled from a table, every value checked against its field's type."""
     hints = get_type_hints(kind, include_extras=True)
     for key in values:
