@@ -1,8 +1,9 @@
-"""A steel frame building made from a seed: columns, beams, joists, braces, a deck, stairs, and modules standing in it."""
+"""A steel frame building made from a seed: columns, beams, joists, braces, a deck, stairs, modules standing in it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -16,7 +17,6 @@ from scanfind.simulate.parts import assemble, blocks
 from scanfind.simulate.scene import Scene
 from scanfind.simulate.stations import LEAST_VISIBLE, best_stations, free_spots
 from scanfind.simulate.steel import along, hollow_beam, i_beam
-import itertools
 
 FRAME_M = (22.0, 14.0, 8.4)
 GRID_X_M, GRID_Y_M = (2.0, 8.0, 14.0, 20.0), (2.5, 7.0, 11.5)
@@ -76,13 +76,13 @@ def _structure() -> Iterator[tuple[Mesh, Pose]]:
     for top in LEVELS_M:
         z = top - BEAM_M[1] / 2
         for y in GRID_Y_M:
-            for a, b in itertools.pairwise(GRID_X_M):
+            for a, b in pairwise(GRID_X_M):
                 yield _named("beam", i_beam([a + half, y, z], [b - half, y, z], *BEAM_M))
-        for c, d in itertools.pairwise(GRID_Y_M):
+        for c, d in pairwise(GRID_Y_M):
             for x in GRID_X_M:
                 yield _named("beam", i_beam([x, c + half, z], [x, d - half, z], *BEAM_M))
             ends = c + BEAM_M[0] / 2 + 0.01, d - BEAM_M[0] / 2 - 0.01
-            for a, b in itertools.pairwise(GRID_X_M):
+            for a, b in pairwise(GRID_X_M):
                 for x in np.linspace(a, b, 4)[1:-1]:
                     level = top - JOIST_M[1] / 2
                     yield _named("joist", i_beam([x, ends[0], level], [x, ends[1], level], *JOIST_M))
@@ -110,12 +110,10 @@ def _deck() -> Mesh:
     """The floor on the first bays, left open around the columns that pass through it."""
     low, open_ = LEVELS_M[0], 0.17
     x_end = GRID_X_M[DECKED] + 0.2
-    strips = [
-        ((GRID_X_M[0] - 0.2, c + open_, low), (x_end, d - open_, DECK_M)) for c, d in itertools.pairwise(GRID_Y_M)
-    ]
+    strips = [((GRID_X_M[0] - 0.2, c + open_, low), (x_end, d - open_, DECK_M)) for c, d in pairwise(GRID_Y_M)]
     strips += [
         ((a + open_, GRID_Y_M[0] - 0.2, low), (b - open_, GRID_Y_M[-1] + 0.2, DECK_M))
-        for a, b in itertools.pairwise(GRID_X_M)
+        for a, b in pairwise(GRID_X_M[: DECKED + 1])
     ]
     return blocks("deck", strips)
 

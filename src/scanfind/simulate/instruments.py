@@ -178,7 +178,7 @@ class Scanner(Instrument):
 
 @dataclass(frozen=True)
 class FrameSensor(Instrument):
-    """A structured-light sensor: a camera's raster of view_width x view_height radians, and a projector `baseline` m beside it.
+    """A structured-light sensor: a camera, view_width x view_height radians, and a projector `baseline` m beside it.
 
     Pixels are even on the image plane. Where the projector's light does not fall, nothing is measured.
     """
@@ -196,11 +196,11 @@ class FrameSensor(Instrument):
 
     def rows(self) -> int:
         """How many pixels the image is high."""
-        return max(2, round(2 * np.tan(self.view_height / 2) / self.step) + 1)
+        return max(2, round(float(2 * np.tan(self.view_height / 2)) / self.step) + 1)
 
     def columns(self) -> int:
         """How many pixels the image is wide."""
-        return max(2, round(2 * np.tan(self.view_width / 2) / self.step) + 1)
+        return max(2, round(float(2 * np.tan(self.view_width / 2)) / self.step) + 1)
 
     def area(self) -> float:
         """That of the image plane at 1 m."""
@@ -218,7 +218,8 @@ class FrameSensor(Instrument):
         """Whether the image shows it."""
         ahead, left, up = directions.T
         shown: Mask = np.abs(left) <= np.tan(self.view_width / 2) * ahead
-        return shown & (np.abs(up) <= np.tan(self.view_height / 2) * ahead)
+        shown &= np.abs(up) <= np.tan(self.view_height / 2) * ahead
+        return shown
 
     def placed(self, position: Floats, look_at: Floats) -> Pose:
         """Looking at `look_at`, upright."""
@@ -276,7 +277,8 @@ class Photogrammetry(Scanner):
             total += np.cos(along + rng.uniform(0.0, 2 * np.pi))
         normal = total * np.sqrt(2.0 / waves)
         # The logistic curve that follows the normal distribution to 1 %.
-        return 1.0 / (1.0 + np.exp(-1.702 * normal))
+        even: Floats = 1.0 / (1.0 + np.exp(-1.702 * normal))
+        return even
 
 
 FARO_FINEST = float(np.radians(0.009))

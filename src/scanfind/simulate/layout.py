@@ -121,7 +121,8 @@ class Layout:
             if at_wall:
                 short = int(np.argmin(size[:2]))
                 corner[short] = (first[short], last[short])[int(rng.integers(2))]
-            thing = self.painted(mesh.name, mesh, at(*(corner - low[:2]), floor.height) @ turn)
+            x, y = corner - low[:2]
+            thing = self.painted(mesh.name, mesh, at(x, y, floor.height) @ turn)
             if (corner + size[:2] <= floor.high).all() and self.put([thing]):
                 return
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,6 @@ from scanfind.simulate.parts import assemble, blocks
 from scanfind.simulate.scene import Scene
 from scanfind.simulate.stations import LEAST_VISIBLE, best_stations, free_spots
 from scanfind.simulate.steel import hollow_beam, i_beam
-import itertools
 
 Floats = NDArray[np.float64]
 
@@ -31,7 +31,8 @@ LINES_FROM_M, LINES_TO_M = 0.4, 17.6
 SLEEPERS_M = (1.0, 4.2, 7.4, 10.6, 13.8, 17.0)
 SHOE_M = 0.1
 RADII_M = (0.03, 0.045, 0.057, 0.084, 0.11, 0.135)
-# Where lines leave the rack, clear of its columns, outermost first; what stands there is 0.7 m wide or, a vessel, 1.6 m.
+# Where lines leave the rack, by side (of y) and tier, clear of its columns, the outermost first; the pumps there are
+# 0.6 m wide, the vessels 1.7 m.
 EXITS_M = {(1.0, 0): (3.0, 8.0, 13.0), (1.0, 1): (4.6, 9.6, 14.6)}
 EXITS_M |= {(-1.0, 0): (3.6, 8.6, 13.6), (-1.0, 1): (5.0, 10.2, 15.2)}
 LAYOUTS = 20
@@ -107,7 +108,7 @@ def _rack() -> Iterator[tuple[Mesh, Pose]]:
             yield furniture.column(TIERS_M[-1] + 0.3), at(x, y)
         for z in TIERS_M:
             yield _named("beam", i_beam([x, RACK_Y_M[0] + 0.12, z - 0.1], [x, RACK_Y_M[1] - 0.12, z - 0.1], 0.15, 0.2))
-    for a, b in itertools.pairwise(BENTS_M):
+    for a, b in pairwise(BENTS_M):
         for y in RACK_Y_M:
             yield _named("strut", i_beam([a + 0.12, y, 3.75], [b - 0.12, y, 3.75], 0.12, 0.16))
             if a in (BENTS_M[0], BENTS_M[-2]):

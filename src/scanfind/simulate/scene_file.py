@@ -24,7 +24,13 @@ from pydantic import Field
 
 from scanfind.cloud import CloudModel
 from scanfind.config import checked, did_you_mean, read_toml
-from scanfind.errors import InvalidGeometryError, ScanfindError, UsageError
+from scanfind.errors import (
+    InvalidGeometryError,
+    MissingExtraError,
+    UnreadableFileError,
+    UnsupportedFormatError,
+    UsageError,
+)
 from scanfind.mesh import Mesh
 from scanfind.models import read_models
 from scanfind.pose import Pose
@@ -175,11 +181,11 @@ def read_scene(path: str | Path) -> SceneFile:
     scene = Scene((_background(around), *things), np.zeros((0, 3)))
     scanner, points = _scanner(scanner_table, f"{path}: scanner")
     if stations:
-        read = [
-            _read(_Station, values, f"{path}: station {k}", _keys(_Station), ("position",))
-            for k, values in enumerate(stations, 1)
+        keys = _keys(_Station)
+        told = [
+            _read(_Station, values, f"{path}: station {k}", keys, ("position",)) for k, values in enumerate(stations, 1)
         ]
-        scene = _with(scene, read)
+        scene = _with(scene, told)
     else:
         scene = with_best_stations(scene, top.stations or 1, top.seed)
     return SceneFile(scene, scanner, points, top.seed)
@@ -224,10 +230,9 @@ def _objects(values: Mapping[str, Any], where: str, folder: Path) -> tuple[list[
     except InvalidGeometryError as error:
         msg = f"{where}: {error}"
         raise UsageError(msg) from error
-    except UsageError:
-        raise
-    except ScanfindError as error:
-        raise type(error)(f"{where}: {error}") from error
+    except (UnreadableFileError, UnsupportedFormatError, MissingExtraError) as error:
+        msg = f"{where}: {error}"
+        raise type(error)(msg) from error
     named = [replace_name(mesh, entry.name) if entry.name and len(meshes) == 1 else mesh for mesh in meshes]
     return [
         SceneObject(mesh.name, mesh, pose, entry.reflectance, entry.target) for mesh in named
@@ -267,9 +272,8 @@ def _part(name: str, sizes: Mapping[str, Any], where: str) -> Mesh:
             msg = f"{where}: {key}: must be a finite number, got {value!r}"
             raise UsageError(msg)
         given[spelled[key]] = float(np.radians(number)) if spelled[key] in ANGLES else number
-    missing = [
-        word for word, key in spelled.items() if key not in given and arguments[key].default is inspect.Parameter.empty
-    ]
+    required = [word for word, key in spelled.items() if arguments[key].default is inspect.Parameter.empty]
+    missing = [word for word in required if word not in sizes]
     if missing:
         msg = f"{where}: a {name} needs {', '.join(missing)}"
         raise UsageError(msg)

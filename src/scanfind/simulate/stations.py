@@ -37,14 +37,15 @@ def free_spots(room: Occupancy, floors: Sequence[Floor], rng: np.random.Generato
         floor = floors[int(rng.integers(len(floors)))]
         foot = np.array([*rng.uniform(floor.low, floor.high), floor.height])
         if scanner_fits(room, foot):
-            found.append(foot + [0.0, 0.0, SCANNER_HEIGHT_M + rng.uniform(-0.1, 0.1)])
+            foot[2] += SCANNER_HEIGHT_M + rng.uniform(-0.1, 0.1)
+            found.append(foot)
         if len(found) == count:
             break
     return np.array(found).reshape(-1, 3)
 
 
 def best_stations(scene: Scene, spots: Floats, count: int) -> tuple[Floats, Floats]:
-    """`count` of the places (M, 3), one after the other that which adds most, and what they see: (count, 3), (targets,).
+    """`count` of the places (M, 3), each that which adds most, and the shares of the targets seen: (count, 3), (T,).
 
     What counts is the share of each target's surface in sight from any station, twice as much while it is below
     a half, lest one be left out for the sake of another; and, as one more target, all the rest but the background.
