@@ -50,6 +50,8 @@ T = TypeVar("T")
 ANGLES = ("angle", "step", "lowest", "highest", "view_width", "view_height", "beam_divergence")
 # Room around a scene without a floor in which a station may be placed, metres.
 AROUND_M = 4.0
+# Above the floor only this is looked at, and beyond this area, whose voxels take 0.2 GB, nothing is.
+TRIPOD_M, LARGEST_M2 = 2.2, 1e5
 
 
 def wall(length: float, height: float, thickness: float = 0.2) -> Mesh:
@@ -196,14 +198,18 @@ def with_best_stations(scene: Scene, count: int, seed: int) -> Scene:
     around, *things = scene.objects
     has_floor = around.name != "nothing"
     shown = [around, *things] if has_floor else things
-    surfaces = [thing.pose.move(surface_points(thing.mesh, np.random.default_rng(0))) for thing in shown]
-    points = np.concatenate(surfaces)
+    corners = np.concatenate([thing.pose.move(thing.mesh.vertices) for thing in shown])
     margin = 0.0 if has_floor else AROUND_M
-    low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
-    size = np.maximum(high - [*low[:2], 0.0], 2.0)
-    room = Occupancy((size[0], size[1], size[2]), (low[0], low[1], 0.0))
-    # The floor itself takes no room.
-    room.take(points[points[:, 2] > 0.03])
+    low, high = corners.min(axis=0)[:2] - margin, corners.max(axis=0)[:2] + margin
+    x, y = np.maximum(high - low, 2.0).tolist()
+    if x * y > LARGEST_M2:
+        msg = f"no station is chosen in a scene of {x:.0f} x {y:.0f} m: give positions, [[station]] or --station"
+        raise UsageError(msg)
+    room = Occupancy((x, y, TRIPOD_M), (low[0], low[1], 0.0))
+    for thing in shown:
+        surface = thing.pose.move(surface_points(thing.mesh, np.random.default_rng(0)))
+        # The floor itself takes no room.
+        room.take(surface[(surface[:, 2] > 0.03) & (surface[:, 2] < TRIPOD_M)])
     spots = free_spots(room, [Floor(0.0, (low[0], low[1]), (high[0], high[1]))], np.random.default_rng([seed, 1]))
     return replace(scene, stations=best_stations(scene, spots, count)[0], look_at=None)
 
@@ -267,10 +273,7 @@ def _part(name: str, sizes: Mapping[str, Any], where: str) -> Mesh:
         if key not in spelled:
             msg = f"{where}: unknown key {key!r} for a {name}: {did_you_mean(key, [*spelled, *_keys(_Where)])}"
             raise UsageError(msg)
-        number = checked(value, hints[spelled[key]], where, key)
-        if not np.isfinite(number):
-            msg = f"{where}: {key}: must be a finite number, got {value!r}"
-            raise UsageError(msg)
+        number = _finite(value, hints[spelled[key]], where, key)
         given[spelled[key]] = float(np.radians(number)) if spelled[key] in ANGLES else number
     required = [word for word, key in spelled.items() if arguments[key].default is inspect.Parameter.empty]
     missing = [word for word in required if word not in sizes]
@@ -298,7 +301,7 @@ def _scanner(values: Mapping[str, Any], where: str) -> tuple[Instrument, int | N
         if key == "points":
             points = checked(value, Annotated[int, Field(ge=1)], where, key)
         elif key in spelled:
-            number = checked(value, hints[spelled[key]], where, key)
+            number = _finite(value, hints[spelled[key]], where, key)
             changes[spelled[key]] = float(np.radians(number)) if spelled[key] in ANGLES else number
         elif key != "preset":
             msg = f"{where}: unknown key {key!r}: {did_you_mean(key, ['preset', 'points', *spelled])}"
@@ -367,5 +370,13 @@ def _read(
         if key not in values:
             msg = f"{where}: needs {key}"
             raise UsageError(msg)
-    filled = {key: checked(value, hints[key], where, key) for key, value in values.items()}
-    return kind(**filled)
+    return kind(**{key: _finite(value, hints[key], where, key) for key, value in values.items()})
+
+
+def _finite(value: object, hint: Any, where: str, key: str) -> Any:
+    """The value as its type, all numbers in it finite."""
+    found = checked(value, hint, where, key)
+    if isinstance(found, (float, tuple)) and not np.isfinite(np.array(found, dtype=np.float64)).all():
+        msg = f"{where}: {key}: must be finite, got {value!r}"
+        raise UsageError(msg)
+    return found
