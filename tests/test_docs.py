@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 COMMANDS = [
     ("find",), ("isolate",), ("info",), ("library", "add"), ("library", "list"), ("library", "show"),
-    ("library", "remove"),
+    ("library", "remove"), ("simulate",),
 ]  # fmt: skip
 # Enough for the examples to come to an end; how well they find is for other tests to say.
 QUICK = {"SCANFIND_SEARCH_TIME_LIMIT_S": "5"}
@@ -134,7 +134,7 @@ def test_the_examples_of_every_help_run(
     monkeypatch.chdir(tmp_path)
     for name, value in QUICK.items():
         monkeypatch.setenv(name, value)
-    order = ["library add", "library list", "library show", "find", "isolate", "info", "library remove"]
+    order = ["simulate", "library add", "library list", "library show", "find", "isolate", "info", "library remove"]
     for command in order:
         for example in _examples(_help(tuple(command.split()), capsys)):
             code = main(shlex.split(example)[1:])
