@@ -18,6 +18,7 @@ from scanfind.scans import open_writer, read_scan
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = [README, *(page.read_text(encoding="utf-8") for page in sorted((ROOT / "docs").glob("*.md")))]
 COMMANDS = [
     ("find",), ("isolate",), ("info",), ("library", "add"), ("library", "list"), ("library", "show"),
     ("library", "remove"), ("simulate",),
@@ -27,7 +28,8 @@ QUICK = {"SCANFIND_SEARCH_TIME_LIMIT_S": "5"}
 
 
 def _fences(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+    fence = re.compile(rf"^```{language}\n(.*?)^```", re.MULTILINE | re.DOTALL)
+    return [code for page in PAGES for code in fence.findall(page)]
 
 
 def _readme_commands() -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
@@ -56,7 +56,7 @@ def small_scene(stations: int = 2) -> Scene:
     objects = (
         SceneObject("wall", parts.box(0.2, 8.0, 6.0), at(WALL_X, -4.0, -3.0)),
         SceneObject("board", parts.box(0.02, 0.6, 0.6), at(2.2, 0.5, -0.3)),
-        SceneObject("spool", pipe_spool(), at(1.2, -3.0, -0.5), target=True),
+        SceneObject("spool", pipe_spool(), at(-1.6, -3.0, -0.5), target=True),
     )
     return Scene(objects, np.array([[0.0, 0.1 * k, 0.2 * k] for k in range(stations)]), None)
 
@@ -121,36 +121,35 @@ def test_noise_is_what_was_asked(base: float, linear: float, square: float, graz
 
 
 def test_mixed_pixels_are_at_edges_only(small: Scene) -> None:
-    for cloud in scan(small, scanner=replace(SCANNERS["phase"], step=0.01)).stations:
+    for cloud in scan(small, scanner=replace(SCANNERS["phase"], step=0.01, beam_divergence=0.005)).stations:
         mixed = cloud.attributes["mixed"] == 1
         assert 10 < mixed.sum() < 0.02 * len(mixed)
         assert (cloud.attributes["object_id"][mixed] == 0).all()
-        # A beam next to each of them ends on something else than the wall, or on nothing.
+        # A beam or two from each of them, one ends on something else than the wall, or on nothing.
         there = {
             (int(r), int(c)): int(k)
             for r, c, k in zip(*(cloud.attributes[key] for key in ("row", "column", "object_id")), strict=True)
         }
         for row, column in zip(cloud.attributes["row"][mixed], cloud.attributes["column"][mixed], strict=True):
-            around = {there.get((int(row) + i, int(column) + j), -1) for i in (-1, 0, 1) for j in (-1, 0, 1)}
+            around = {there.get((int(row) + i, int(column) + j), -1) for i in range(-2, 3) for j in range(-2, 3)}
             assert around - {0}
 
 
 def test_points_lie_on_the_models_where_the_truth_has_them(generated: Scene) -> None:
-    found = scan(generated, scanner=SCANNERS["faro-ls-840-he"], points=150_000)
+    # A beam that grazes a pipe's rim leaves it by all of its error: so errors that grow there are for another test.
+    found = scan(generated, scanner=replace(SCANNERS["faro-ls-840-he"], noise_grazing=0.0), points=100_000)
+    rng = np.random.default_rng(0)
     for object_id in generated.target_ids():
         thing = generated.objects[object_id]
         for cloud in found.stations:
-            mine = cloud.attributes["object_id"] == object_id
-            seen = thing.pose.inverse().move(cloud.xyz[mine])[:120]
-            if not len(seen):
+            mine = np.flatnonzero(cloud.attributes["object_id"] == object_id)
+            mine = rng.permutation(mine)[:30]
+            if not len(mine):
                 continue
             assert cloud.origin is not None
-            reach = np.linalg.norm(cloud.xyz[mine][:120] - cloud.origin, axis=1)
-            # Off the surface by the range's error times the cosine, which the growing sigma never exceeds.
-            sigma = found.scanner.sigma(reach, np.ones(len(reach)))
-            off = distances_to(seen, thing.mesh.triangles())
-            assert (off < 4 * sigma + 1e-5).mean() > 0.995
-            assert (off < 6 * sigma + 1e-5).all()
+            reach = np.linalg.norm(cloud.xyz[mine] - cloud.origin, axis=1)
+            off = distances_to(thing.pose.inverse().move(cloud.xyz[mine]), thing.mesh.triangles())
+            assert (off < 4 * found.scanner.sigma(reach, np.ones(len(reach))) + 1e-5).all()
 
 
 def test_things_do_not_stand_in_each_other(generated: Scene) -> None:
@@ -160,7 +159,7 @@ def test_things_do_not_stand_in_each_other(generated: Scene) -> None:
     for (a, box_a), (b, box_b) in permutations(zip(placed, boxes, strict=True), 2):
         if (box_a[0] > box_b[1] - 0.02).any() or (box_a[1] < box_b[0] + 0.02).any():
             continue
-        points, normals = sample_oriented(a.mesh, np.random.default_rng(0), 400)
+        points, normals = sample_oriented(a.mesh, np.random.default_rng(0), 200)
         below = a.pose.move(points - 0.02 * normals)
         below = below[((below > box_b[0]) & (below < box_b[1])).all(axis=1)]
         body = trimesh.Trimesh(b.pose.move(b.mesh.vertices), b.mesh.faces, process=False)
@@ -199,7 +198,8 @@ def test_every_format_keeps_points_ids_and_stations(format: str, small: Scene, t
     assert np.array_equal(np.concatenate(ids), wanted)
     if format in ("e57", "ptx"):
         origins = {chunk.scan: chunk.origin for chunk in chunks}
-        assert [origins[k].tolist() for k in (0, 1)] == pytest.approx(small.stations.tolist())  # type: ignore[union-attr]
+        for station, at_ in enumerate(small.stations):
+            assert origins[station] == pytest.approx(at_, abs=1e-12)
     else:
         station = np.concatenate([chunk.attributes["station"] for chunk in chunks])
         assert np.bincount(station).tolist() == [len(cloud) for cloud in expected.stations]
@@ -284,7 +284,8 @@ def test_remarks_say_where_not_to_stand(small: Scene) -> None:
     assert "station 1 at 3.10 0.00 0.00 stands inside of something" in said[0]
     assert "station 2" in said[1]
     assert "0.10 m from a surface" in said[1]
-    assert "may be missed" in said[2]
+    said = simulate(small, scanner=Scanner(step=0.1), stations=[inside]).remarks
+    assert "spool (2): 0 % in sight, may be missed below a third" in said[-1]
 
 
 def test_best_stations_see_more_than_any_pair_drawn(small: Scene) -> None:
@@ -333,12 +334,12 @@ def test_targets_of_one_name_are_one_model(small: Scene) -> None:
         simulate(replace(small, objects=(*small.objects, other)))
 
 
-@pytest.mark.parametrize("make", [plant, frame])
-def test_a_scene_without_room_says_so(make: object) -> None:
+@pytest.mark.parametrize("make", [shop, plant, frame])
+def test_a_target_larger_than_the_place_is_refused_at_once(make: Callable[..., Scene]) -> None:
+    with pytest.raises(UsageError, match=r"slab is 30\.0 x 30\.0 x 1\.0 m"):
+        make(0, replace(parts.box(30.0, 30.0, 1.0), name="slab"))
     with pytest.raises(UsageError, match="targets, copies and stations"):
-        plant(0, copies=0)
-    with pytest.raises(UsageError, match="no place"):
-        shop(0, parts.box(30.0, 30.0, 1.0))
+        make(0, pipe_spool(), copies=0)
 
 
 @pytest.mark.parametrize(

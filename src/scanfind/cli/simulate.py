@@ -106,18 +106,18 @@ def simulate(
     from scanfind.progress import progress_on
     from scanfind.simulate import simulate as simulate_scene
 
-    made, device, wanted, chance = _scene(scene, model or [], units, copies, stations, seed)
+    preset = _preset(scanner)
     changes = {
         "step": None if step is None else float(np.radians(step)),
         "noise": noise,
         **dict(zip(("nearest", "farthest"), _numbers(range, 2, "--range MIN,MAX"), strict=False)),
     }
-    device = replace(_preset(scanner) or device, **{key: value for key, value in changes.items() if value is not None})
-    if points is not None:
-        wanted = _whole(points)
-    elif step is not None:
-        wanted = None
+    asked = None if points is None else _whole(points)
     where = None if station is None else [_numbers(text, 3, "--station X,Y,Z") for text in station]
+    made, device, wanted, chance = _scene(scene, model or [], units, copies, stations, seed)
+    device = replace(preset or device, **{key: value for key, value in changes.items() if value is not None})
+    if asked is not None or step is not None:
+        wanted = asked
     with progress_on() as progress:
         done = simulate_scene(
             made, out, scanner=device, stations=where, points=wanted, seed=chance, format=format,

@@ -11,7 +11,7 @@ from scanfind.errors import UsageError
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose
 from scanfind.simulate import furniture
-from scanfind.simulate.layout import Floor, Layout, at
+from scanfind.simulate.layout import Floor, Layout, at, targets_of
 from scanfind.simulate.objects import box_frame
 from scanfind.simulate.parts import assemble, blocks
 from scanfind.simulate.scene import Scene
@@ -37,10 +37,7 @@ def frame(
     steel, crates and drums. `stations` scanners stand where they see most of the targets, LEAST_VISIBLE of each.
     Everything follows from `seed`. Raises UsageError when that cannot be had.
     """
-    targets = [box_frame()] if target is None else [target] if isinstance(target, Mesh) else list(target)
-    if not targets or copies < 1 or stations < 1:
-        msg = f"a frame needs targets, copies and stations, got {len(targets)}, {copies} and {stations}"
-        raise UsageError(msg)
+    targets = targets_of(box_frame() if target is None else target, copies, stations, "frame", FRAME_M)
     for attempt in range(LAYOUTS):
         layout = _empty_frame((seed, attempt))
         if not all(layout.add_target(mesh) for mesh in targets for _ in range(copies)):

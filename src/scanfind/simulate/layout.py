@@ -8,6 +8,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.errors import UsageError
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose
 from scanfind.simulate import furniture
@@ -144,6 +145,27 @@ class Layout:
                 timber = blocks("timber", [((-0.05, -0.3, 0.0), (0.05, 0.3, tall))])
                 supports.append(self.painted("timber", timber, pose))
         return supports
+
+
+def targets_of(
+    target: Mesh | Sequence[Mesh], copies: int, stations: int, place: str, size: tuple[float, float, float]
+) -> list[Mesh]:
+    """The door of every generated scene: what is looked for, as a list; `place` is what it is to stand in, `size` m.
+
+    Raises UsageError where a count is not positive, or a target is larger than the place.
+    """
+    targets = [target] if isinstance(target, Mesh) else list(target)
+    if not targets or copies < 1 or stations < 1:
+        msg = f"a {place} needs targets, copies and stations, got {len(targets)}, {copies} and {stations}"
+        raise UsageError(msg)
+    for mesh in targets:
+        extent = np.ptp(mesh.vertices, axis=0)
+        across = np.sort(extent)
+        if across[2] > np.hypot(*size[:2]) or across[1] > max(size):
+            wide, room = (" x ".join(f"{length:.1f}" for length in lengths) for lengths in (extent, size))
+            msg = f"{mesh.name} is {wide} m, too large for the {place} of {room} m: check its units"
+            raise UsageError(msg)
+    return targets
 
 
 def at(x: float, y: float, z: float = 0.0) -> Pose:

@@ -14,7 +14,7 @@ from scanfind.mesh import Mesh
 from scanfind.pose import Pose
 from scanfind.simulate import equipment, furniture
 from scanfind.simulate.equipment import FLANGE_OVER_PIPE, TOWARDS_X, flange_thickness
-from scanfind.simulate.layout import TRIES, Layout, at, yaw
+from scanfind.simulate.layout import TRIES, Layout, at, targets_of, yaw
 from scanfind.simulate.objects import RIGHT_ANGLE, Route, other_spool, pipe_spool
 from scanfind.simulate.parts import assemble, blocks
 from scanfind.simulate.scene import Scene
@@ -66,10 +66,7 @@ def plant(
     saw horses and goalposts. `stations` scanners stand where they see most of the targets, LEAST_VISIBLE of each.
     Everything follows from `seed`. Raises UsageError when that cannot be had.
     """
-    targets = [pipe_spool()] if target is None else [target] if isinstance(target, Mesh) else list(target)
-    if not targets or copies < 1 or stations < 1:
-        msg = f"a plant needs targets, copies and stations, got {len(targets)}, {copies} and {stations}"
-        raise UsageError(msg)
+    targets = targets_of(pipe_spool() if target is None else target, copies, stations, "plant", PLANT_M)
     for attempt in range(LAYOUTS):
         layout = _empty_plant((seed, attempt))
         if not all(layout.add_target(mesh) for mesh in targets for _ in range(copies)):

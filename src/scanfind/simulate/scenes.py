@@ -11,7 +11,7 @@ from scanfind.errors import UsageError
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose
 from scanfind.simulate import furniture
-from scanfind.simulate.layout import TRIES, Layout, at
+from scanfind.simulate.layout import TRIES, Layout, at, targets_of
 from scanfind.simulate.objects import other_spool
 from scanfind.simulate.parts import assemble
 from scanfind.simulate.scanner import Scanner, shares
@@ -53,10 +53,7 @@ def shop(
     elsewhere for each point on a target (a copy's average) are within `clutter`, and LEAST_VISIBLE of each copy is
     in sight. Everything follows from `seed`. Raises UsageError when that cannot be had.
     """
-    targets = [target] if isinstance(target, Mesh) else list(target)
-    if not targets or copies < 1 or stations < 1:
-        msg = f"a shop needs targets, copies and stations, got {len(targets)}, {copies} and {stations}"
-        raise UsageError(msg)
+    targets = targets_of(target, copies, stations, "shop", SHOP_M)
     for attempt in range(LAYOUTS):
         layout = _empty_shop((seed, attempt))
         if not all(layout.add_target(mesh) for mesh in targets for _ in range(copies)):
