@@ -198,8 +198,8 @@ def test_every_format_keeps_points_ids_and_stations(format: str, small: Scene, t
     assert np.array_equal(np.concatenate(ids), wanted)
     if format in ("e57", "ptx"):
         origins = {chunk.scan: chunk.origin for chunk in chunks}
-        for station, at_ in enumerate(small.stations):
-            assert origins[station] == pytest.approx(at_, abs=1e-12)
+        for number, at_ in enumerate(small.stations):
+            assert origins[number] == pytest.approx(at_, abs=1e-12)
     else:
         station = np.concatenate([chunk.attributes["station"] for chunk in chunks])
         assert np.bincount(station).tolist() == [len(cloud) for cloud in expected.stations]
@@ -234,8 +234,9 @@ def test_a_frame_sensor_sees_its_frustum_and_not_the_projectors_shadow(small: Sc
 
 
 def test_photogrammetry_knows_no_stations_and_has_holes(small: Scene, tmp_path: Path) -> None:
-    device = replace(SCANNERS["photogrammetry"], step=0.01, holes=0.3)
-    assert isinstance(device, Photogrammetry)
+    preset = SCANNERS["photogrammetry"]
+    assert isinstance(preset, Photogrammetry)
+    device = replace(preset, step=0.01, holes=0.3)
     simulate(small, tmp_path / "sim", scanner=device)
     (chunk,) = read_scan(tmp_path / "sim" / "scan.e57")
     assert chunk.origin is None
