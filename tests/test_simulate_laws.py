@@ -80,7 +80,7 @@ def test_same_seed_same_points_on_any_number_of_threads(
     device = SCANNERS[name].with_step(max(0.02, SCANNERS[name].finest))
     one, two, four = (scan(small, scanner=device, seed=3, threads=threads) for threads in (1, 2, 4))
     other = scan(small, scanner=device, seed=4)
-    assert len(one) > 1000
+    assert len(one) > 500
     for a, *same, c in zip(one.stations, two.stations, four.stations, other.stations, strict=True):
         for b in same:
             assert np.array_equal(a.xyz, b.xyz)
@@ -159,7 +159,7 @@ def test_things_do_not_stand_in_each_other(generated: Scene) -> None:
     for (a, box_a), (b, box_b) in permutations(zip(placed, boxes, strict=True), 2):
         if (box_a[0] > box_b[1] - 0.02).any() or (box_a[1] < box_b[0] + 0.02).any():
             continue
-        points, normals = sample_oriented(a.mesh, np.random.default_rng(0), 200)
+        points, normals = sample_oriented(a.mesh, np.random.default_rng(0), 120)
         below = a.pose.move(points - 0.02 * normals)
         below = below[((below > box_b[0]) & (below < box_b[1])).all(axis=1)]
         body = trimesh.Trimesh(b.pose.move(b.mesh.vertices), b.mesh.faces, process=False)
@@ -206,7 +206,7 @@ def test_every_format_keeps_points_ids_and_stations(format: str, small: Scene, t
 
 
 def test_a_frame_sensors_scans_come_back_in_the_scenes_frame(small: Scene, tmp_path: Path) -> None:
-    device = SCANNERS["structured-light"]
+    device = replace(SCANNERS["structured-light"], step=0.01)
     turned = replace(small, look_at=np.tile([2.2, 0.8, 0.1], (2, 1)))
     for format in ("e57", "ptx"):
         done = simulate(turned, tmp_path / format, scanner=device, format=format)
@@ -353,7 +353,7 @@ def test_a_target_larger_than_the_place_is_refused_at_once(make: Callable[..., S
         (["plant", "--plan", "--step", "1", "--points", "5"], "exclude each other"),
         (["plant", "--plan", "--points", "many"], "--points must be a whole number"),
         (["plant", "--plan", "--station", "1,2"], "takes 3 numbers"),
-        (["plant", "--plan", "--range", "5,1"], "nearest < farthest"),
+        (["frame", "--plan", "--range", "5,1"], "nearest < farthest"),
         (["plant", "--plan", "--model", "none.stl"], "none.stl: no such file"),
         (["none.toml", "--plan"], "none.toml: cannot be read"),
         (["none.toml", "--plan", "--copies", "2"], "are for shop, plant and frame"),
