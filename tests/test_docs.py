@@ -18,16 +18,18 @@ from scanfind.scans import open_writer, read_scan
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = [README, *(page.read_text(encoding="utf-8") for page in sorted((ROOT / "docs").glob("*.md")))]
 COMMANDS = [
     ("find",), ("isolate",), ("info",), ("library", "add"), ("library", "list"), ("library", "show"),
-    ("library", "remove"),
+    ("library", "remove"), ("simulate",),
 ]  # fmt: skip
 # Enough for the examples to come to an end; how well they find is for other tests to say.
 QUICK = {"SCANFIND_SEARCH_TIME_LIMIT_S": "5"}
 
 
 def _fences(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+    fence = re.compile(rf"^```{language}\n(.*?)^```", re.MULTILINE | re.DOTALL)
+    return [code for page in PAGES for code in fence.findall(page)]
 
 
 def _readme_commands() -> list[str]:
@@ -134,7 +136,7 @@ def test_the_examples_of_every_help_run(
     monkeypatch.chdir(tmp_path)
     for name, value in QUICK.items():
         monkeypatch.setenv(name, value)
-    order = ["library add", "library list", "library show", "find", "isolate", "info", "library remove"]
+    order = ["simulate", "library add", "library list", "library show", "find", "isolate", "info", "library remove"]
     for command in order:
         for example in _examples(_help(tuple(command.split()), capsys)):
             code = main(shlex.split(example)[1:])

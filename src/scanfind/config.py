@@ -163,7 +163,7 @@ def _overlay(node: T, values: Mapping[str, Any], where: str, prefix: str, known:
             raise UsageError(msg)
         current = getattr(node, key)
         if not is_dataclass(current):
-            changes[key] = _checked(value, hints[key], where, name)
+            changes[key] = checked(value, hints[key], where, name)
         elif isinstance(value, Mapping):
             changes[key] = _overlay(current, value, where, f"{name}.", known)
         else:
@@ -176,7 +176,7 @@ def _overlay(node: T, values: Mapping[str, Any], where: str, prefix: str, known:
         raise UsageError(msg) from error
 
 
-def _checked(value: object, hint: Any, where: str, name: str) -> Any:
+def checked(value: object, hint: Any, where: str, name: str) -> Any:
     """The value as the field's type; UsageError in one line where it is none."""
     if value == "none" and type(None) in get_args(hint):
         return None  # neither TOML nor the environment has a word for it

@@ -8,10 +8,10 @@ import re
 import shutil
 import time
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from scanfind import schema
 from scanfind.cloud import shift_for
@@ -32,22 +32,30 @@ MODELS = "models.scanfind"
 NAME_BYTES = 120  # of a model's name in a file name; file systems stop at 255
 
 
+class Kind(NamedTuple):
+    """What a folder of ours is known by: its document, and which files that says are in it."""
+
+    document: str
+    files: Callable[[Path], set[str]]
+
+
 @contextmanager
-def result_folder(out: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
+def result_folder(out: str | Path, *, overwrite: bool = False, kind: Kind | None = None) -> Iterator[Path]:
     """A folder to fill beside `out`, which takes the name `out` when the block ends well and goes when it does not.
 
-        overwrite : replace an older scanfind result; never anything else
+        overwrite : replace an older folder of the same kind; never anything else
+        kind : None for the result of a search
 
     Raises OutputError where `out` is a file, holds what scanfind did not write, or cannot be written.
     """
     target = Path(out).absolute()
-    check_free(target, overwrite=overwrite)
+    check_free(target, overwrite=overwrite, kind=kind)
     staged = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         staged.mkdir()
         yield staged
-        check_free(target, overwrite=overwrite)  # a search takes long enough for somebody else to have come
+        check_free(target, overwrite=overwrite, kind=kind)  # a search takes long enough for somebody else to have come
         _swap(staged, target)
     except OSError as error:  # scans and models say theirs in words of their own
         msg = f"{out}: results cannot be written: {error.strerror or error}: choose another folder or make room"
@@ -56,20 +64,21 @@ def result_folder(out: str | Path, *, overwrite: bool = False) -> Iterator[Path]
         shutil.rmtree(staged, ignore_errors=True)
 
 
-def check_free(target: Path, *, overwrite: bool) -> None:
-    """Raise OutputError unless a result folder may take this place."""
+def check_free(target: Path, *, overwrite: bool, kind: Kind | None = None) -> None:
+    """Raise OutputError unless a folder of this kind (None: a result) may take this place."""
+    kind = kind or Kind(RESULTS_JSON, lambda folder: _files_of(read_results(folder)))
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return
     if not target.is_dir():
         msg = f"{target}: is a file: results need a folder, choose another"
         raise OutputError(msg)
-    if not (target / RESULTS_JSON).is_file():
+    if not (target / kind.document).is_file():
         msg = f"{target}: holds files that are not scanfind's: choose another folder"
         raise OutputError(msg)
     if not overwrite:
         msg = f"{target}: holds an earlier result: choose another folder or pass --overwrite"
         raise OutputError(msg)
-    foreign = sorted(_files_under(target) - _files_of(read_results(target)))
+    foreign = sorted(_files_under(target) - kind.files(target))
     if foreign:
         msg = f"{target}: holds {foreign[0]}, which scanfind did not write: move it away or choose another folder"
         raise OutputError(msg)

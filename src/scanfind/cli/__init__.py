@@ -16,6 +16,7 @@ from scanfind.cli.info import info
 from scanfind.cli.isolate import isolate
 from scanfind.cli.library import library
 from scanfind.cli.options import note
+from scanfind.cli.simulate import simulate
 from scanfind.errors import Interrupted, ScanfindError, UsageError
 
 HELP = """Find known 3D objects (CAD, BIM or a piece of scan) in cluttered laser scans.
@@ -37,6 +38,7 @@ app.command(find, usage="scanfind find SCAN... (--model FILE... | --library LIB)
 app.command(library)
 app.command(isolate, usage="scanfind isolate RESULT_DIR SCAN... [OPTIONS]")
 app.command(info, usage="scanfind info FILE... [--json]")
+app.command(simulate, usage="scanfind simulate SCENE (--out OUT | --plan) [OPTIONS]")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from scanfind.schema import DetectionEntry, Matrix, RefusedEntry, Results
+    from scanfind.simulate import Sight
 
 FOUND = (
     "id", "model", "x m", "y m", "z m", "yaw °", "pitch °", "roll °", "score", "visible %", "rms mm", "points",
@@ -30,6 +31,13 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def found_table(results: Results) -> str:
     """One line a detection; "mean" and "95 %" are of the signed, and of the absolute distances of its points."""
     return table(FOUND, [_found_row(found) for found in results.detections])
+
+
+def sight_table(sights: Sequence[Sight]) -> str:
+    """One line a target of a simulated scan: what each station sees of it, and all together."""
+    stations = [f"from {k} %" for k in range(1, len(sights[0].visible) + 1)]
+    header = ("id", "target", "points", "seen %", *stations, "spacing mm", "incidence °", "steepest °", "range m")
+    return table(header, [_sight_row(sight) for sight in sights])
 
 
 def closest(results: Results) -> list[str]:
@@ -71,6 +79,19 @@ def _found_row(found: DetectionEntry) -> list[str]:
         _number(deviation.mean_m if deviation else None, 1, 1e3),
         _number(deviation.p95_m if deviation else None, 1, 1e3),
         ", ".join(motion.kind for motion in found.unobservable) or "–",
+    ]
+
+
+def _sight_row(sight: Sight) -> list[str]:
+    incidence = [None if angle is None else degrees(angle) for angle in (sight.incidence, sight.steepest)]
+    return [
+        str(sight.object_id),
+        sight.name,
+        f"{sum(sight.points):,}",
+        *(_number(share, 0, 100.0) for share in (sight.together, *sight.visible)),
+        _number(sight.spacing_m, 1, 1e3),
+        *(_number(angle, 0) for angle in incidence),
+        f"{_number(sight.nearest_m, 1)} to {_number(sight.farthest_m, 1)}",
     ]
 
 

@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike
 
 from scanfind.cloud import CHUNK_POINTS, Attributes, Floats, PointChunk, ScanInfo
 from scanfind.errors import UnreadableFileError, UnsupportedFormatError, UsageError
+from scanfind.pose import Pose
 
 # Suffix → module of this package. A COPC file (.copc.laz) is a LAZ file.
 SCAN_READERS: Mapping[str, str] = {
@@ -57,6 +58,9 @@ CLOUD_WRITERS: Mapping[str, str] = {
     "pcd": "pcd",
 }
 
+# Suffix without its dot → module whose StationsWriter keeps where each station stood.
+STATION_WRITERS: Mapping[str, str] = {"e57": "e57_writer", "ptx": "ptx_writer"}
+
 
 class CloudWriter(Protocol):
     """An open cloud file that points stream into; it appears under its name only when closed without an error."""
@@ -76,6 +80,17 @@ class CloudWriter(Protocol):
     def __enter__(self) -> Self: ...
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None: ...
+
+
+class StationsFile(CloudWriter, Protocol):
+    """An open file of several scans, each with its pose. Points are given in the scene's frame, station by station."""
+
+    def station(self, name: str, pose: Pose, raster: tuple[int, int]) -> None:
+        """Begin a scan: what is written from now on is its own.
+
+        pose : scene_from_station
+        raster : how many rows and columns of beams it has; row and column of its points say which are theirs
+        """
 
 
 def read_scan(
@@ -126,6 +141,21 @@ def open_writer(
         raise UnsupportedFormatError(msg)
     dtypes = {name: np.dtype(dtype) for name, dtype in fields.items()}
     writer: CloudWriter = _module(CLOUD_WRITERS[kind]).Writer(path, dtypes, shift=_as_origin(shift), crs=crs)
+    return writer
+
+
+def open_stations(path: str | Path, fields: Mapping[str, np.dtype[Any]]) -> StationsFile:
+    """Open a file of several scans for streaming, as `open_writer` does; `station` has to be called first.
+
+    Raises UnsupportedFormatError for a format that knows no stations, or a field it has no place for.
+    """
+    path = Path(path)
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in STATION_WRITERS:
+        msg = f"{path.name}: {path.suffix} keeps no stations; choose {', '.join(STATION_WRITERS)}"
+        raise UnsupportedFormatError(msg)
+    dtypes = {name: np.dtype(dtype) for name, dtype in fields.items()}
+    writer: StationsFile = _module(STATION_WRITERS[kind]).StationsWriter(path, dtypes, shift=np.zeros(3))
     return writer
 
 

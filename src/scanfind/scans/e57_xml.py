@@ -61,6 +61,6 @@ def _check_shape(text: bytes, name: str) -> None:
     parser.EndElementHandler = leave
     try:
         parser.Parse(text, True)
-    except expat.ExpatError as error:
+    except (expat.ExpatError, LookupError) as error:  # of an unknown encoding
         msg = f"{name} is damaged: its XML is not well formed ({error})"
         raise UnreadableFileError(msg) from error

@@ -86,6 +86,14 @@ def saw_horse(width: float, height: float) -> Mesh:
     return assemble("saw_horse", [(top, Pose.identity()), *legs])
 
 
+def goalpost(width: float, height: float) -> Mesh:
+    """A support of 100 mm hollow sections: a beam along y whose top is at `height`, on two posts."""
+    y, half = width / 2, 0.05
+    posts = [((-half, v - half, 0.0), (half, v + half, height)) for v in (half - y, y - half)]
+    plates = [((-2 * half, v - 2 * half, 0.0), (2 * half, v + 2 * half, 0.015)) for v in (half - y, y - half)]
+    return blocks("goalpost", [*posts, *plates, ((-half, -y, height - 2 * half), (half, y, height))])
+
+
 def drum() -> Mesh:
     """A 200 litre drum with its two hoops."""
     r, h = 0.285, 0.88

@@ -9,6 +9,7 @@ import numpy as np
 from scanfind.errors import InvalidGeometryError
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose
+from scanfind.simulate.equipment import FLANGE_OVER_PIPE, TOWARDS_X, flange_thickness, joint, valve
 from scanfind.simulate.parts import SIDES, assemble, blocks, elbow, elbow_end, flange, pipe, tee, tee_branch
 
 FRAME_SIZE_M = (3.5, 2.0, 2.0)
@@ -48,6 +49,7 @@ class Route:
         self.radius = radius
         self.end = start
         self.placed: list[tuple[Mesh, Pose]] = []
+        self.sides: list[Route] = []
 
     def _put(self, part: Mesh, part_end: Pose) -> None:
         self.placed.append((part, self.end))
@@ -68,12 +70,28 @@ class Route:
         self.roll(roll)
         side = Route(radius, self.end @ tee_branch(length, height))
         self._put(tee(self.radius, radius, length, height), _forward(length))
+        self.sides.append(side)
         return side
+
+    def all_placed(self) -> list[tuple[Mesh, Pose]]:
+        """Its parts and those of its branches."""
+        return [*self.placed, *(part for side in self.sides for part in side.all_placed())]
 
     def flange(self) -> None:
         """Close this end with a blind flange of usual proportions."""
-        part, thickness = _blind(self.radius)
-        self._put(part, _forward(thickness))
+        thickness = flange_thickness(self.radius)
+        self._put(flange(self.radius, FLANGE_OVER_PIPE * self.radius, thickness), _forward(thickness))
+
+    def joint(self) -> None:
+        """A pair of flanges bolted together."""
+        part, length = joint(self.radius)
+        self._put(part, _forward(length))
+
+    def valve(self, roll: float = 0.0) -> None:
+        """A flanged gate valve, its handwheel towards this end's x after a `roll`."""
+        self.roll(roll)
+        part, length = valve(self.radius)
+        self._put(part, _forward(length))
 
     def roll(self, angle: float) -> None:
         """Turn about the pipe; by whole facets only, or the corners of the next part would miss these."""
@@ -86,10 +104,9 @@ class Route:
 
 def spool(name: str, design: SpoolDesign) -> Mesh:
     """A spool built to `design`, one closed surface; first leg's axis along +x from the origin, branch up (+z)."""
-    along_x = Pose(np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]), np.zeros(3))
-    lead = Route(design.radius, along_x @ Pose.from_rotation_vector([np.pi, 0.0, 0.0]))
+    lead = Route(design.radius, TOWARDS_X @ Pose.from_rotation_vector([np.pi, 0.0, 0.0]))
     lead.flange()
-    main = Route(design.radius, along_x)
+    main = Route(design.radius, TOWARDS_X)
     tee_length = 2.6 * design.radius
 
     main.straight(design.branch_at - tee_length / 2)
@@ -169,8 +186,3 @@ def box_frame() -> Mesh:
 
 def _forward(length: float) -> Pose:
     return Pose(np.eye(3), np.array([0.0, 0.0, length]))
-
-
-def _blind(radius: float) -> tuple[Mesh, float]:
-    thickness = 0.25 * radius + 0.01
-    return flange(radius, 1.7 * radius, thickness), thickness

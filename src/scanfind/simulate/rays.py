@@ -67,3 +67,19 @@ class RayCaster:
         hits = self.shoot(station, toward / np.maximum(distance, 1e-9)[:, None])
         clear: NDArray[np.bool_] = hits.distance > distance - slack
         return clear
+
+    def around(self, point: Floats) -> tuple[float, float]:
+        """How near the nearest surface is in a thousand directions, and which share of what is seen shows its back.
+
+        A point inside of something closed sees backs only; one in the open, fronts.
+        """
+        k = np.arange(1000) + 0.5
+        height, turn = 1 - 2 * k / 1000, np.pi * (1 + 5**0.5) * k  # a spiral, evenly over the sphere
+        level = np.sqrt(1 - height**2)
+        ways = np.stack([level * np.cos(turn), level * np.sin(turn), height], axis=1)
+        found = self._scene.run(np.tile(point, (1000, 1)).astype(np.float32), ways.astype(np.float32), output=1)
+        hit = found["primID"] >= 0
+        if not hit.any():
+            return float("inf"), 0.0
+        backs = np.einsum("ij,ij->i", self._normals[found["primID"][hit]], ways[hit]) > 0
+        return float(found["tfar"][hit].min()), float(backs.mean())

@@ -1,12 +1,13 @@
-"""A virtual terrestrial laser scanner: a panoramic raster of beams with range noise, mixed pixels and dropouts."""
+"""Scanning a scene: a raster of beams from each station, with range noise, mixed pixels and dropouts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,72 +15,24 @@ from numpy.typing import ArrayLike, NDArray
 from scanfind.cloud import PointCloud, as_points
 from scanfind.errors import UsageError
 from scanfind.pose import Pose
+from scanfind.simulate.instruments import Instrument, Scanner
 from scanfind.simulate.rays import RayCaster
 from scanfind.simulate.scene import BACKGROUND, Scene
+
+__all__ = ["Block", "Scanner", "SimulatedScan", "Survey", "scan", "shares"]
 
 Floats = NDArray[np.float64]
 
 # A block of columns is the unit of work and of chance: fixed, so that threads and memory do not change the scan.
 BLOCK_RAYS = 500_000
 PILOT_RAYS = 40_000
-
-
-@dataclass(frozen=True)
-class Scanner:
-    """What the instrument can do. Lengths in metres, angles in radians.
-
-    step : angle between neighbouring beams, both ways (0.0016 is 10 mm at 6.3 m)
-    lowest, highest : elevation of the raster's first and last row
-    nearest, farthest : range limits
-    noise : range noise sigma
-    noise_per_metre : what it grows by with range
-    noise_grazing : what it grows by at grazing incidence: sigma / cos**noise_grazing
-    beam_diameter, beam_divergence : the beam's footprint is their sum at a range, full width
-    mixing : two surfaces under one beam closer than this in range give one blended return; farther ones the first
-    edge : a range step between neighbours beyond this, beyond what a slope makes, is looked at for mixed pixels
-    dimmest : least return, as reflectance x cos(incidence) x (10 m / range)², that is surely seen
-    """
-
-    step: float = 0.0016
-    lowest: float = float(np.radians(-60.0))
-    highest: float = float(np.radians(90.0))
-    nearest: float = 0.4
-    farthest: float = 80.0
-    noise: float = 0.002
-    noise_per_metre: float = 0.0
-    noise_grazing: float = 0.0
-    beam_diameter: float = 0.005
-    beam_divergence: float = 0.0006
-    mixing: float = 1.0
-    edge: float = 0.03
-    dimmest: float = 0.02
-
-    def __post_init__(self) -> None:
-        if not (0.0 < self.step <= 0.5 and -np.pi / 2 <= self.lowest < self.highest <= np.pi / 2):
-            msg = (
-                "a scanner needs 0 < step <= 0.5 and -90 <= lowest < highest <= 90 degrees, got "
-                f"step {self.step}, {np.degrees(self.lowest):.1f} to {np.degrees(self.highest):.1f}"
-            )
-            raise UsageError(msg)
-
-    def rows(self) -> int:
-        """How many beams a column has."""
-        return max(2, round((self.highest - self.lowest) / self.step) + 1)
-
-    def columns(self) -> int:
-        """How many columns a full turn has."""
-        return max(4, round(2 * np.pi / self.step))
-
-    def directions(self, row: ArrayLike, column: ArrayLike) -> Floats:
-        """Unit directions (N, 3) of the beams at row, column (N,): row 0 lowest, column 0 towards +x, turning to +y."""
-        elevation = self.lowest + (self.highest - self.lowest) * np.asarray(row) / (self.rows() - 1)
-        azimuth = 2 * np.pi * np.asarray(column) / self.columns()
-        level = np.cos(elevation)
-        return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
-
-    def with_step(self, step: float) -> Scanner:
-        """The same instrument set to another resolution."""
-        return replace(self, step=step)
+ATTRIBUTES: Mapping[str, np.dtype[np.generic]] = {
+    "intensity": np.dtype(np.float32),
+    "row": np.dtype(np.int32),
+    "column": np.dtype(np.int32),
+    "object_id": np.dtype(np.int32),
+    "mixed": np.dtype(np.uint8),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +47,7 @@ class SimulatedScan:
     """
 
     stations: list[PointCloud]
-    scanner: Scanner
+    scanner: Instrument
     truth: Mapping[str, list[Pose]]
     object_names: tuple[str, ...]
 
@@ -106,10 +59,147 @@ class SimulatedScan:
         return np.concatenate([s.xyz[s.attributes["object_id"] == object_id] for s in self.stations])
 
 
+class Block(NamedTuple):
+    """Some points of one station, and how many beams were sent out for them."""
+
+    station: int
+    beams: int
+    cloud: PointCloud
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """A scan about to be made: an instrument, where it will stand, and the scene made ready for its rays.
+
+    poses : scene_from_instrument at each station
+    """
+
+    scene: Scene
+    caster: RayCaster
+    scanner: Instrument
+    poses: tuple[Pose, ...]
+    seed: int
+
+    @staticmethod
+    def of(
+        scene: Scene,
+        stations: ArrayLike | None = None,
+        scanner: Instrument | None = None,
+        seed: int = 0,
+        points: int | None = None,
+    ) -> Survey:
+        """Arguments and errors as for `scan`."""
+        where = as_points(scene.stations if stations is None else stations, "stations")
+        if not len(where):
+            msg = "a scan needs at least one station"
+            raise UsageError(msg)
+        device = scanner or Scanner()
+        poses = tuple(device.placed(at, to) for at, to in zip(where, scene.looked_at(where), strict=True))
+        survey = Survey(scene, scene.caster(), device, poses, seed)
+        return survey if points is None else survey.with_step(_step_for(points, survey))
+
+    def with_step(self, step: float) -> Survey:
+        """The same survey at another resolution."""
+        return Survey(self.scene, self.caster, self.scanner.with_step(step), self.poses, self.seed)
+
+    def beams(self) -> int:
+        """How many beams all stations send out."""
+        return self.scanner.rows() * self.scanner.columns() * len(self.poses)
+
+    def blocks(self, threads: int) -> Iterator[Block]:
+        """All points, station by station, columns in order; the same for any number of threads.
+
+        Only a few blocks wait to be taken, however slow the taker is.
+        """
+        columns = max(1, BLOCK_RAYS // self.scanner.rows())
+        work = [(k, first) for k in range(len(self.poses)) for first in range(0, self.scanner.columns(), columns)]
+        pool, waiting = ThreadPoolExecutor(max(1, threads)), deque[Future[Block]]()
+        try:
+            for station, first in work:
+                waiting.append(pool.submit(self._block, station, columns, first))
+                if len(waiting) > 2 * threads:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+    def _block(self, station: int, columns: int, first: int) -> Block:
+        """Scan `columns` columns from `first` on: at most columns x rows points."""
+        rng = np.random.default_rng([self.seed, station, first])
+        scanner, pose = self.scanner, self.poses[station]
+        rows = scanner.rows()
+        column = np.arange(first, min(first + columns, scanner.columns()))
+        row = np.tile(np.arange(rows), len(column))
+        column = np.repeat(column, rows)
+        directions = pose.turn(scanner.aim(row, column, rng))
+        hits = self.caster.shoot(pose.translation, directions)
+        distance, owner = hits.distance.copy(), hits.owner
+
+        at_edge = np.flatnonzero(_edges(distance.reshape(-1, rows), scanner.edge).reshape(-1))
+        mixed = np.zeros(len(distance), dtype=np.uint8)
+        blended, where = self._blend(pose.translation, directions[at_edge], distance[at_edge], rng)
+        distance[at_edge[where]], mixed[at_edge[where]] = blended, 1
+
+        with np.errstate(invalid="ignore"):
+            echo = np.where(owner >= 0, self.scene.reflectances()[owner], 0.0) * hits.cosine
+            seen = scanner.reaches(distance)
+            seen &= rng.random(len(distance)) < scanner.brightness(distance, echo)
+        kept = np.flatnonzero(seen)
+        surface = pose.translation + directions[kept] * distance[kept, None]
+        kept = kept[scanner.keeps(self.caster, pose, surface, rng, self.seed)]
+        distance, echo, mixed = distance[kept], echo[kept], mixed[kept]
+        measured = distance + scanner.sigma(distance, hits.cosine[kept]) * rng.standard_normal(len(kept))
+        intensity = np.clip(echo + 0.02 * rng.standard_normal(len(kept)), 0.0, 1.0)
+        attributes = {
+            "intensity": intensity,
+            "row": row[kept],
+            "column": column[kept],
+            "object_id": np.where(mixed > 0, BACKGROUND, owner[kept]),
+            "mixed": mixed,
+        }
+        cloud = PointCloud(
+            pose.translation + directions[kept] * measured[:, None],
+            {name: attributes[name].astype(dtype) for name, dtype in self.fields().items()},
+            pose.translation if scanner.has_stations else None,
+        )
+        return Block(station, len(row), cloud)
+
+    def fields(self) -> dict[str, np.dtype[np.generic]]:
+        """The attributes its points have; what has no stations has no raster either."""
+        left_out = () if self.scanner.has_stations else ("row", "column")
+        return {name: dtype for name, dtype in ATTRIBUTES.items() if name not in left_out}
+
+    def _blend(
+        self, origin: Floats, directions: Floats, distance: Floats, rng: np.random.Generator
+    ) -> tuple[Floats, NDArray[np.int64]]:
+        """Mixed pixels among K beams at edges: the blended ranges and which beams have them.
+
+        A second ray somewhere in the beam's footprint; where it meets another surface not too far from the first, the
+        return is a weighted mean of both ranges, as the phase of the summed light is.
+        """
+        scanner = self.scanner
+        if not len(directions):
+            return np.zeros(0), np.zeros(0, dtype=np.int64)
+        reach = np.where(np.isfinite(distance), distance, scanner.farthest)
+        half = (scanner.beam_diameter + scanner.beam_divergence * reach) / 2
+        across = np.cross(directions, rng.standard_normal(directions.shape))
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        offset = across * (half * np.sqrt(rng.random(len(half))))[:, None]
+        aside = directions * reach[:, None] + offset
+        aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+        second = self.caster.shoot(origin, aside).distance
+        weight = rng.random(len(half))
+        with np.errstate(invalid="ignore"):
+            gap = np.abs(second - distance)
+            where = np.flatnonzero((gap > scanner.edge) & (gap < scanner.mixing))
+        return distance[where] + weight[where] * (second[where] - distance[where]), where
+
+
 def scan(
     scene: Scene,
     stations: ArrayLike | None = None,
-    scanner: Scanner | None = None,
+    scanner: Instrument | None = None,
     seed: int = 0,
     points: int | None = None,
     threads: int = 2,
@@ -120,24 +210,12 @@ def scan(
     points : about how many valid points in all; sets the scanner's step. None keeps it
     Same seed, same points, on any number of threads. Raises UsageError, InvalidGeometryError.
     """
-    where = as_points(scene.stations if stations is None else stations, "stations")
-    if not len(where):
-        msg = "a scan needs at least one station"
-        raise UsageError(msg)
-    caster = scene.caster()
-    reflectance = np.array([thing.reflectance for thing in scene.objects])
-    device = scanner or Scanner()
-    if points is not None:
-        device = device.with_step(_step_for(points, caster, reflectance, where, device, seed))
-    columns = max(1, BLOCK_RAYS // device.rows())
-    clouds = []
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        for station, origin in enumerate(where):
-            shoot = partial(_block, caster, reflectance, origin, device, (seed, station), columns)
-            blocks = list(pool.map(shoot, range(0, device.columns(), columns)))
-            attributes = {name: np.concatenate([a[name] for _, a in blocks]) for name in blocks[0][1]}
-            clouds.append(PointCloud(np.concatenate([xyz for xyz, _ in blocks]), attributes, origin.copy()))
-    return SimulatedScan(clouds, device, scene.truth(), tuple(thing.name for thing in scene.objects))
+    survey = Survey.of(scene, stations, scanner, seed, points)
+    blocks: list[list[PointCloud]] = [[] for _ in survey.poses]
+    for block in survey.blocks(threads):
+        blocks[block.station].append(block.cloud)
+    clouds = [_joined(parts) for parts in blocks]
+    return SimulatedScan(clouds, survey.scanner, scene.truth(), tuple(thing.name for thing in scene.objects))
 
 
 def shares(caster: RayCaster, stations: Floats, scanner: Scanner) -> Floats:
@@ -152,69 +230,27 @@ def shares(caster: RayCaster, stations: Floats, scanner: Scanner) -> Floats:
     return share
 
 
-def _step_for(
-    points: int, caster: RayCaster, reflectance: Floats, stations: Floats, scanner: Scanner, seed: int
-) -> float:
+def _joined(parts: Sequence[PointCloud]) -> PointCloud:
+    attributes = {name: np.concatenate([part.attributes[name] for part in parts]) for name in parts[0].attributes}
+    origin = parts[0].origin
+    return PointCloud(
+        np.concatenate([part.xyz for part in parts]), attributes, None if origin is None else origin.copy()
+    )
+
+
+def _step_for(points: int, survey: Survey) -> float:
     """The step that gives about `points` valid ones: a coarse pilot scan tells what share of beams comes back."""
     if points < 1:
         msg = f"the number of points must be at least 1, got {points}"
         raise UsageError(msg)
-    turn = 2 * np.pi * (scanner.highest - scanner.lowest)
-    pilot = scanner.with_step(min(0.5, float(np.sqrt(turn / PILOT_RAYS))))
-    back = sum(
-        len(_block(caster, reflectance, origin, pilot, (seed, station), pilot.columns(), 0)[0])
-        for station, origin in enumerate(stations)
-    )
-    share = back / (pilot.rows() * pilot.columns() * len(stations))
+    area = survey.scanner.area()
+    pilot = survey.with_step(min(0.5, max(survey.scanner.finest, float(np.sqrt(area / PILOT_RAYS)))))
+    shots = map(partial(pilot._block, columns=pilot.scanner.columns(), first=0), range(len(pilot.poses)))
+    share = sum(len(block.cloud) for block in shots) / pilot.beams()
     if share == 0.0:
         msg = "no beam comes back: the stations see nothing of the scene within the scanner's range"
         raise UsageError(msg)
-    return min(0.5, float(np.sqrt(turn * len(stations) * share / points)))
-
-
-def _block(
-    caster: RayCaster,
-    reflectance: Floats,
-    origin: Floats,
-    scanner: Scanner,
-    seed: tuple[int, int],
-    columns: int,
-    first: int,
-) -> tuple[Floats, dict[str, NDArray[Any]]]:
-    """Scan `columns` columns from `first` on: points (N, 3) and their attributes, N at most columns x rows."""
-    rng = np.random.default_rng([*seed, first])
-    rows = scanner.rows()
-    column = np.arange(first, min(first + columns, scanner.columns()))
-    row = np.tile(np.arange(rows), len(column))
-    column = np.repeat(column, rows)
-    directions = scanner.directions(row, column)
-    hits = caster.shoot(origin, directions)
-    distance, owner = hits.distance, hits.owner
-
-    at_edge = np.flatnonzero(_edges(distance.reshape(-1, rows), scanner.edge).reshape(-1))
-    distance = distance.copy()
-    mixed = np.zeros(len(distance), dtype=np.uint8)
-    blended, where = _blend(caster, scanner, origin, directions[at_edge], distance[at_edge], rng)
-    distance[at_edge[where]], mixed[at_edge[where]] = blended, 1
-
-    with np.errstate(invalid="ignore"):
-        echo = np.where(owner >= 0, reflectance[owner], 0.0) * hits.cosine
-        back = echo * (10.0 / np.maximum(distance, 1.0)) ** 2
-        seen = (distance >= scanner.nearest) & (distance <= scanner.farthest)
-        seen &= rng.random(len(distance)) < back / scanner.dimmest
-    distance, echo = distance[seen], echo[seen]
-    sigma = (scanner.noise + scanner.noise_per_metre * distance) / np.maximum(
-        hits.cosine[seen], 0.05
-    ) ** scanner.noise_grazing
-    measured = distance + sigma * rng.standard_normal(len(distance))
-    intensity = np.clip(echo + 0.02 * rng.standard_normal(len(echo)), 0.0, 1.0)
-    return origin + directions[seen] * measured[:, None], {
-        "intensity": intensity.astype(np.float32),
-        "row": row[seen].astype(np.int32),
-        "column": column[seen].astype(np.int32),
-        "object_id": np.where(mixed[seen] > 0, np.int32(BACKGROUND), owner[seen]).astype(np.int32),
-        "mixed": mixed[seen],
-    }
+    return min(0.5, float(np.sqrt(area * len(survey.poses) * share / points)))
 
 
 def _edges(distance: Floats, step: float) -> NDArray[np.bool_]:
@@ -231,33 +267,3 @@ def _edges(distance: Floats, step: float) -> NDArray[np.bool_]:
         middle = np.moveaxis(edge, axis, 0)
         middle[1:-1] |= np.moveaxis(bend, axis, 0)
     return edge
-
-
-def _blend(
-    caster: RayCaster,
-    scanner: Scanner,
-    origin: Floats,
-    directions: Floats,
-    distance: Floats,
-    rng: np.random.Generator,
-) -> tuple[Floats, NDArray[np.int64]]:
-    """Mixed pixels among K beams at edges: the blended ranges and which beams have them.
-
-    A second ray somewhere in the beam's footprint; where it meets another surface not too far from the first, the
-    return is a weighted mean of both ranges, as the phase of the summed light is.
-    """
-    if not len(directions):
-        return np.zeros(0), np.zeros(0, dtype=np.int64)
-    reach = np.where(np.isfinite(distance), distance, scanner.farthest)
-    half = (scanner.beam_diameter + scanner.beam_divergence * reach) / 2
-    across = np.cross(directions, rng.standard_normal(directions.shape))
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    offset = across * (half * np.sqrt(rng.random(len(half))))[:, None]
-    aside = directions * reach[:, None] + offset
-    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
-    second = caster.shoot(origin, aside).distance
-    weight = rng.random(len(half))
-    with np.errstate(invalid="ignore"):
-        gap = np.abs(second - distance)
-        where = np.flatnonzero((gap > scanner.edge) & (gap < scanner.mixing))
-    return distance[where] + weight[where] * (second[where] - distance[where]), where

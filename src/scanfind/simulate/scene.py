@@ -35,10 +35,12 @@ class Scene:
 
     objects : by object id; 0 is the background (the room)
     stations : (S, 3) where scanners stand
+    look_at : (S, 3) what each is turned to, for instruments with a narrow view; None: to the nearest target
     """
 
     objects: tuple[SceneObject, ...]
     stations: Floats
+    look_at: Floats | None = None
 
     def truth(self) -> dict[str, list[Pose]]:
         """Target name → scene_from_model of each copy."""
@@ -51,6 +53,20 @@ class Scene:
     def target_ids(self) -> list[int]:
         """The object ids of what is looked for."""
         return [k for k, thing in enumerate(self.objects) if thing.target]
+
+    def looked_at(self, stations: Floats) -> Floats:
+        """(S, 3): what the instruments at `stations` (S, 3) are turned to."""
+        if self.look_at is not None and len(self.look_at) == len(stations):
+            return self.look_at
+        shown = [thing for thing in self.objects if thing.target] or list(self.objects)
+        corners = [thing.pose.move(thing.mesh.vertices) for thing in shown]
+        middles = np.array([(c.min(axis=0) + c.max(axis=0)) / 2 for c in corners])
+        nearest: Floats = middles[[int(np.argmin(np.linalg.norm(middles - at, axis=1))) for at in stations]]
+        return nearest
+
+    def reflectances(self) -> Floats:
+        """By object id, (objects,)."""
+        return np.array([thing.reflectance for thing in self.objects])
 
     def caster(self) -> RayCaster:
         """The scene ready to be shot at; owners of hits are object ids."""
