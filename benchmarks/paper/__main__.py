@@ -23,7 +23,8 @@ from scanfind.errors import ScanfindError
 
 def main(
     seeds: str = "5000-5019", experiments: str = ",".join(EXPERIMENTS), targets: str = "PS,BF",
-    system: str = "scanfind,sharif2017,rivals", rows: str = "", out: Path = RESULTS, *, fresh: bool = False, date: str = "",
+    system: str = "scanfind,sharif2017,rivals", rows: str = "", out: Path = RESULTS, *, fresh: bool = False,
+    date: str = "",
 ) -> None:  # fmt: skip
     """Run the paper's experiments; rows already there are not run again.
 
@@ -57,10 +58,10 @@ def main(
 def ask(case: Case, name: str, system: System) -> Row:
     """Put a case to a system and judge what it says."""
     seed = 1000 * case.run + case.seed
-    row = judged(case, name, system(case.cloud, case.target.mesh, seed))
+    row = judged(case, name, system(case.cloud, case.model, seed))
     if case.experiment != "effectiveness" or row.success or name not in OURS:
         return row
-    again = (scanfind_with(parameters, case.cloud, case.target.mesh, seed) for parameters in retries(OURS[name]))
+    again = (scanfind_with(parameters, case.cloud, case.model, seed) for parameters in retries(OURS[name]))
     return replace(row, at_all=int(any(one.poses and is_right(error_of(one.poses[0], case)) for one in again)))
 
 

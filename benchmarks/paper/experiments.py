@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
-from benchmarks.paper.definitions import clutter_ratio, completeness_ratio, density_ratio
+from benchmarks.paper.definitions import RIGHT_MM, clutter_ratio, completeness_ratio, density_ratio
 from benchmarks.paper.scenes import Cloud, cropped, hall_scene, paper_scene, sized, thinned
 from benchmarks.paper.targets import Target, paper
+from scanfind.cloud import CloudModel
+from scanfind.mesh import Mesh
+from scanfind.pose import Pose
 
 # Beyond the paper's own rows.
 MORE_CLUTTER = (100.0, 200.0, 500.0)
@@ -22,20 +25,25 @@ BRANCHES = 3  # stream of chance
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One scene to be searched, of one row.
+    """One scene to be searched for one instance of one model.
 
-    row : its name, unique within experiment and target; asked, had : the ratio the row is about
-    run : which of several searches of the same scene
+    target : the model's name in the tables; row : the row's, unique within experiment and target
+    asked, had : the ratio the row is about; run : which of several searches of the same scene
+    model : what is sought; cloud.truth is where it is, `others` where further instances of it are
+    right_mm : how far the centre of a right pose may be off
     """
 
     experiment: str
-    target: Target
+    target: str
     row: str
     asked: float
     had: float
     seed: int
     run: int
     cloud: Cloud
+    model: Mesh | CloudModel
+    others: tuple[Pose, ...] = ()
+    right_mm: float = RIGHT_MM
 
 
 class Scenes:
@@ -70,46 +78,35 @@ class Row:
 def density(target: Target) -> list[Row]:
     """Tables 5, 6: the fully cluttered scene, down-sampled. What clutter the paper's had is not said; so, all of it."""
     table = paper()[f"table{_number(target, 5)}_density_{target.key}"][0]
-    return [
-        Row(
-            name=f"{ratio:g}",
-            asked=ratio,
-            cut=lambda scenes, count=points: thinned(scenes.full, count),
-            had=lambda cloud, _: density_ratio(len(cloud)),
-        )
-        for ratio, points in zip(table["density_ratio"], table["scene_points"], strict=True)
-    ]
+    rows = zip(table["density_ratio"], table["scene_points"], strict=True)
+    return [Row(f"{ratio:g}", ratio, partial(_thinned, points), _density) for ratio, points in rows]
 
 
 def clutter(target: Target) -> list[Row]:
     """Tables 7, 8: cropped to what is near the target. Beyond them: a hall, at the points of the paper's full scene.
 
-    So the target of a hall is sparser as well: at a ratio of 500 it has 643 points.
+    So the target in a hall is sparser as well: at a ratio of 500 it has 643 points.
     """
-    table = paper()[f"table{_number(target, 7)}_clutter_{target.key}"][0]
-    had = lambda cloud, _: clutter_ratio(len(cloud), cloud.object_points())  # noqa: E731
-    near = [Row(f"{r:g}", r, lambda scenes, ratio=r: cropped(scenes.full, ratio), had) for r in table["clutter_ratio"]]
-    points = target.scene_points
-    far = [Row(f"{r:g}", r, lambda scenes, ratio=r: sized(scenes.hall, ratio, points), had) for r in MORE_CLUTTER]
-    return [*near, *far]
+    near = paper()[f"table{_number(target, 7)}_clutter_{target.key}"][0]["clutter_ratio"]
+    return [
+        *(Row(f"{ratio:g}", ratio, partial(_cropped, ratio), _clutter) for ratio in near),
+        *(Row(f"{ratio:g}", ratio, partial(_in_hall, ratio), _clutter) for ratio in MORE_CLUTTER),
+    ]
 
 
 def completeness(target: Target) -> list[Row]:
     """Tables 9, 10: branches removed in random order, of the last a part, until the ratio is met; clutter stays."""
-    table = paper()[f"table{_number(target, 9)}_completeness_{target.key}"][0]
-    ratios = sorted({*table["completeness_ratio"], *MORE_COMPLETENESS}, reverse=True)
-    return [Row(f"{r:g}", r, lambda scenes, ratio=r: incomplete(scenes, ratio), _left) for r in ratios]
+    of_paper = paper()[f"table{_number(target, 9)}_completeness_{target.key}"][0]["completeness_ratio"]
+    ratios = sorted({*of_paper, *MORE_COMPLETENESS}, reverse=True)
+    return [Row(f"{ratio:g}", ratio, partial(_incomplete, ratio), _left) for ratio in ratios]
 
 
 def branch(target: Target) -> list[Row]:
-    """Is any branch critical, as one was in Table 9? Each is removed by itself; the ratio asked for is the scene's own."""
-    return [
-        Row(one.name, float("nan"), lambda scenes, number=k: without(scenes.full, number), _left)
-        for k, one in enumerate(target.branches)
-    ]
+    """Is any branch critical, as one was in Table 9? Each is removed by itself, however much of the object it is."""
+    return [Row(one.name, float("nan"), partial(_without, k), _left) for k, one in enumerate(target.branches)]
 
 
-def effectiveness(target: Target) -> list[Row]:
+def effectiveness(_: Target) -> list[Row]:
     """Tables 11, 12: the fully cluttered scene, again and again."""
     return [Row("full", 1.0, lambda scenes: scenes.full, _left, RUNS_PER_SCENE)]
 
@@ -136,27 +133,46 @@ def cases(
             cloud = row.cut(scenes)
             had = row.had(cloud, scenes)
             for run in runs:
-                yield Case(experiment, target, row.name, row.asked, had, seed, run, cloud)
+                yield Case(experiment, target.key, row.name, row.asked, had, seed, run, cloud, target.mesh)
 
 
-def incomplete(scenes: Scenes, ratio: float) -> Cloud:
+def _thinned(points: int, scenes: Scenes) -> Cloud:
+    return thinned(scenes.full, points)
+
+
+def _cropped(ratio: float, scenes: Scenes) -> Cloud:
+    return cropped(scenes.full, ratio)
+
+
+def _in_hall(ratio: float, scenes: Scenes) -> Cloud:
+    return sized(scenes.hall, ratio, scenes.target.scene_points)
+
+
+def _incomplete(ratio: float, scenes: Scenes) -> Cloud:
     """The full scene with `ratio` of the target's points left."""
-    cloud, target = scenes.full, scenes.target
+    cloud, branches = scenes.full, scenes.target.branches
     rng = np.random.default_rng([scenes.seed, BRANCHES])
     gone = np.zeros(len(cloud), dtype=bool)
     surplus = cloud.object_points() - round(ratio * cloud.object_points())
-    for number in rng.permutation(len(target.branches)):
-        one = target.branches[number]
+    for number in rng.permutation(len(branches)):
         points = np.flatnonzero(cloud.branch == number)
-        at = cloud.truth.inverse().move(cloud.xyz[points])[:, one.along()] * rng.choice([-1.0, 1.0])
-        gone[points[np.argsort(at)][:surplus]] = True
+        along = cloud.truth.inverse().move(cloud.xyz[points])[:, branches[number].along()]
+        from_an_end = np.argsort(along * rng.choice([-1.0, 1.0]))
+        gone[points[from_an_end[:surplus]]] = True
         surplus -= min(surplus, len(points))
     return cloud.take(~gone)
 
 
-def without(cloud: Cloud, number: int) -> Cloud:
-    """The scene without one branch."""
-    return cloud.take(cloud.branch != number)
+def _without(number: int, scenes: Scenes) -> Cloud:
+    return scenes.full.take(scenes.full.branch != number)
+
+
+def _density(cloud: Cloud, _: Scenes) -> float:
+    return density_ratio(len(cloud))
+
+
+def _clutter(cloud: Cloud, _: Scenes) -> float:
+    return clutter_ratio(len(cloud), cloud.object_points())
 
 
 def _left(cloud: Cloud, scenes: Scenes) -> float:

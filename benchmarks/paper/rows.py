@@ -10,6 +10,7 @@ import numpy as np
 
 from benchmarks.common import PoseError, centre_of, origin_lines, pose_error, write_rows
 from benchmarks.paper.definitions import (
+    FARTHEST_M,
     is_right,
     model_points,
     precision,
@@ -18,8 +19,9 @@ from benchmarks.paper.definitions import (
     rms_surface,
 )
 from benchmarks.paper.experiments import Case
-from benchmarks.paper.systems import Answer
+from benchmarks.paper.systems import Answer, surface_of
 from scanfind.errors import UsageError
+from scanfind.mesh import Mesh
 from scanfind.pose import Pose
 
 NAN = float("nan")
@@ -64,21 +66,29 @@ class Row:
 
 
 def judged(case: Case, system: str, answer: Answer) -> Row:
-    """An answer against the truth. Its first pose is the answer; every point of any of its poses counts as found."""
-    cloud, mesh = case.cloud, case.target.mesh
-    error = error_of(answer.poses[0], case) if answer.poses else PoseError(NAN, NAN)
-    right = is_right(error)
-    first = answer.isolated[0] if answer.isolated else np.zeros(0, np.int64)
-    every = np.unique(np.concatenate(answer.isolated)) if answer.isolated else first
+    """An answer against the truth.
+
+    Its first pose is the answer; the nearest of its first K where the scene holds K instances. All points of all its
+    poses count as isolated: what it found besides is not hidden.
+    """
+    cloud = case.cloud
+    instances = 1 + len(case.others)
+    poses, cuts = (each[: instances if answer.ranked else None] for each in (answer.poses, answer.isolated))
+    errors = [error_of(pose, case) for pose in poses[:instances]]
+    best = min(range(len(errors)), key=lambda k: errors[k].mm, default=-1)
+    error = errors[best] if best >= 0 else PoseError(NAN, NAN)
+    right = is_right(error, case.right_mm)
+    isolated = cuts[best] if best >= 0 else np.zeros(0, np.int64)
+    every = np.unique(np.concatenate(cuts)) if cuts and instances == 1 else isolated
     rms = floor = surface = NAN
     if right:
-        model = model_points(mesh)
-        rms = rms_paper(cloud.xyz[first], answer.poses[0], model) if len(first) else NAN
-        floor = rms_paper(cloud.xyz[cloud.on_object], cloud.truth, model)
-        surface = rms_surface(cloud.xyz[cloud.on_object], answer.poses[0], mesh)
+        pose, model, own = poses[best], model_points(case.model), cloud.xyz[cloud.on_object]
+        rms = rms_paper(cloud.xyz[isolated], pose, model)
+        floor = rms_paper(own, cloud.truth, model)
+        surface = rms_surface(own, pose, surface_of(case.model, FARTHEST_M))
     return Row(
         experiment=case.experiment,
-        target=case.target.key,
+        target=case.target,
         system=system,
         row=case.row,
         asked=case.asked,
@@ -89,8 +99,8 @@ def judged(case: Case, system: str, answer: Answer) -> Row:
         run=case.run,
         success=int(right),
         at_all=int(right),
-        false=len(answer.poses) - int(right),
-        rr=recognition_rate(first, cloud.on_object),
+        false=max(0, len(poses) - instances) + int(best >= 0 and not right),
+        rr=recognition_rate(isolated, cloud.on_object),
         precision=precision(every, cloud.on_object),
         rms_cm=1e2 * rms,
         rms_floor_cm=1e2 * floor,
@@ -109,17 +119,18 @@ def judged(case: Case, system: str, answer: Answer) -> Row:
 
 def error_of(pose: Pose, case: Case) -> PoseError:
     """How far a pose is from the truth, at the middle of the model's box."""
-    return pose_error(pose, case.cloud.truth, centre_of(case.target.mesh.vertices))
+    centre = centre_of(case.model.vertices if isinstance(case.model, Mesh) else case.model.points)
+    return pose_error(pose, case.cloud.truth, centre)
 
 
 def why(case: Case, answer: Answer) -> str:
     """Why nothing right was found."""
     if answer.error:
         return answer.error
-    refused = [reason for pose, reason in answer.refused if is_right(error_of(pose, case))]
+    refused = [reason for pose, reason in answer.refused if is_right(error_of(pose, case), case.right_mm)]
     if refused:
         return f"right pose refused: {refused[0]}"
-    if any(is_right(error_of(pose, case)) for pose in answer.poses[1:]):
+    if any(is_right(error_of(pose, case), case.right_mm) for pose in answer.poses[1:]):
         return "right pose is not the first"
     return "a wrong pose only" if answer.poses else "nothing found"
 
@@ -131,12 +142,11 @@ class Ledger:
     """
 
     def __init__(self, path: Path, date: str = "", fresh: bool = False) -> None:
-        self.path, self.date = path, date
-        self.rows: list[Row] = []
+        self.path, self.rows = path, list[Row]()
+        self.machine, self.versions, self.commit, _, self.dated = origin_lines("", date)
         if path.exists() and not fresh:
             comments, self.rows = read_rows(path)
-            origin = [line for line in origin_lines("", "") if not line.startswith(("seeds", "date"))]
-            if changed := [line for line in origin if line not in comments]:
+            if changed := [line for line in (self.machine, self.versions, self.commit) if line not in comments]:
                 msg = f"{path}: its rows have another origin than {changed[0]!r}; use --fresh to replace them, or --out"
                 raise UsageError(msg)
         self.keys = {row.key() for row in self.rows}
@@ -145,7 +155,8 @@ class Ledger:
         """Keep a row."""
         self.rows.append(row)
         self.keys.add(row.key())
-        write_rows(self.path, self.rows, origin_lines(_ranges({row.seed for row in self.rows}), self.date))
+        seeds = f"seeds: {_ranges({row.seed for row in self.rows})}"
+        write_rows(self.path, self.rows, [self.machine, self.versions, self.commit, seeds, self.dated])
 
 
 def read_rows(path: Path) -> tuple[list[str], list[Row]]:

@@ -21,13 +21,13 @@ from scanfind.simulate.scenes import PILOT, SCANNER_HEIGHT_M, shop
 
 Ints = NDArray[np.int64]
 
-# Table 3, FARO LS 840-HE: "± 3 mm at 25 m" taken as the standard deviation at every range, which is the hardest reading.
+# Table 3, FARO LS 840-HE: "± 3 mm at 25 m" read as the standard deviation at every range, which is the hardest reading.
 FARO = Scanner(noise=0.003, nearest=0.6, farthest=40.0)
 # Chance of a seed's scene: of the scan, of thinning, of the branches removed.
 SCAN, THIN = 0, 1
 # A scan has this much more than the row that needs most of it, for mixed pixels and dropouts take some.
 SPARE = 1.15
-# A shop whose raw clutter is near this needs no more than 1.1 million points to show the target as the paper's scan did.
+# A shop of at most this clutter shows the target as densely as the paper's scan did with 1.1 million points at most.
 MOST_RAW_CLUTTER = 180.0
 HALL_BAYS = (5, 4)
 BAYS_MADE = 8
@@ -194,7 +194,8 @@ def standing(layout: Layout, rng: np.random.Generator) -> Floats:
     while True:
         foot = np.array([*rng.uniform([1.0, 1.0], [SHOP_M[0] - 1.0, SHOP_M[1] - 1.0]), 0.0])
         if layout.room.fits(foot + body):
-            return foot + [0.0, 0.0, SCANNER_HEIGHT_M]
+            foot[2] = SCANNER_HEIGHT_M
+            return foot
 
 
 def _shift(place: tuple[int, int]) -> Floats:
@@ -202,4 +203,4 @@ def _shift(place: tuple[int, int]) -> Floats:
 
 
 def _at(place: tuple[int, int], corner: tuple[float, ...] = (0.0, 0.0)) -> Pose:
-    return Pose(np.eye(3), _shift(place) + [*corner, 0.0])
+    return Pose(np.eye(3), _shift(place) + np.array([*corner, 0.0]))

@@ -4,24 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from benchmarks.common import STAGES
 from benchmarks.paper.definitions import Ints
+from scanfind.cloud import CloudModel
 from scanfind.errors import UsageError
 from scanfind.find import find
 from scanfind.library import ModelLibrary
 from scanfind.mesh import Mesh
 from scanfind.model import ModelParameters
-from scanfind.near_surface import near_triangles, signed_distances
+from scanfind.near_surface import near_model, signed_distances
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.pose import Pose
 
 if TYPE_CHECKING:
     from benchmarks.paper.scenes import Cloud
+    from scanfind.kernels.distance import NearSurface
 
 # Within how much of the placed model a rival's points are cut: scanfind's own rule, four times the scan's noise.
 RIVAL_TOLERANCE_M = 0.012
@@ -35,6 +38,7 @@ class Answer:
 
     poses : scene_from_model, best first; isolated : the points of each, indices into the scene's
     seconds : by stage, and in total; refused : poses that came close and were not believed, with the reason
+    ranked : the poses are a ranking of what may be there, not each a claim
     """
 
     poses: list[Pose]
@@ -42,14 +46,16 @@ class Answer:
     seconds: dict[str, float]
     refused: list[tuple[Pose, str]] = field(default_factory=list)
     error: str = ""
+    ranked: bool = False
 
 
-System = Callable[["Cloud", Mesh, int], Answer]
+Sought = Mesh | CloudModel
+System = Callable[["Cloud", Sought, int], Answer]
 
 
-def scanfind_with(parameters: Parameters, cloud: Cloud, mesh: Mesh, seed: int) -> Answer:
+def scanfind_with(parameters: Parameters, cloud: Cloud, model: Sought, seed: int) -> Answer:
     """scanfind; the model is prepared once and for all, as in the paper's offline phase."""
-    found = find(cloud.stations(), library(mesh, parameters), parameters=parameters, seed=seed)
+    found = find(cloud.stations(), library(model, parameters), parameters=parameters, seed=seed)
     isolated = [np.zeros(0, np.int64) if one.isolated is None else one.isolated.attributes["point"] for one in found]
     seconds = {stage: found.timings_s.get(stage, 0.0) for stage in (*STAGES, "total")}
     refused = [(one.scene_from_model, one.reason) for one in found.refused]
@@ -57,24 +63,40 @@ def scanfind_with(parameters: Parameters, cloud: Cloud, mesh: Mesh, seed: int) -
 
 
 @cache
-def library(mesh: Mesh, parameters: Parameters) -> ModelLibrary:
+def library(model: Sought, parameters: Parameters) -> ModelLibrary:
     """The model, prepared with these parameters."""
     made = ModelLibrary.in_memory()
-    made.add(mesh, ModelParameters(parameters.surface, parameters.pairs))
+    made.add(model, ModelParameters(parameters.surface, parameters.pairs))
     return made
 
 
-def rival(name: str, cloud: Cloud, mesh: Mesh, seed: int) -> Answer:
-    """A rival's first answer; points are cut for it and at no cost in time, since none of them does."""
-    from benchmarks import rivals
+@lru_cache(maxsize=8)
+def surface_of(model: Sought, reach: float) -> NearSurface:
+    """The model's surface as isolation sees it, to be asked for distances up to `reach` metres."""
+    return near_model(library(model, PRESETS["default"]).models()[0], reach)
 
-    said = rivals.run(name, cloud.xyz, cloud.origins, cloud.station, mesh, time_limit_s=RIVAL_LIMIT_S, seed=seed)
+
+def rival(name: str, cloud: Cloud, model: Sought, seed: int) -> Answer:
+    """A rival's answer. Points are cut for it, and at no cost in time, since none of them does."""
+    run = import_module("benchmarks.rivals").run
+    mesh = model if isinstance(model, Mesh) else as_mesh(model)
+    said = run(name, cloud.xyz, cloud.origins, cloud.station, mesh, time_limit_s=RIVAL_LIMIT_S, seed=seed)
     stages = {"grid": "planes", "search": "match", "refine": "refine", "total": "total"}
     seconds = {ours: said.seconds.get(theirs, 0.0) for ours, theirs in stages.items()}
-    surface = near_triangles(mesh.triangles(), RIVAL_TOLERANCE_M)
-    best = said.poses[:1]
-    near = [signed_distances(surface, pose.inverse().move(cloud.xyz))[0] for pose in best]
-    return Answer(best, [np.flatnonzero(~np.isnan(d)) for d in near], seconds, error=said.error)
+    surface = surface_of(model, RIVAL_TOLERANCE_M)
+    near = [signed_distances(surface, pose.inverse().move(cloud.xyz))[0] for pose in said.poses]
+    return Answer(said.poses, [np.flatnonzero(~np.isnan(d)) for d in near], seconds, error=said.error, ranked=True)
+
+
+def as_mesh(model: CloudModel) -> Mesh:
+    """A piece of scan as a rival takes it: a small triangle a sample, facing as the sample does."""
+    prepared = library(model, PRESETS["default"]).models()[0]
+    points, normals = prepared.samples.points, prepared.samples.normals
+    across = np.cross(normals, np.where(np.abs(normals[:, :1]) < 0.7, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+    across *= prepared.spacing / 2 / np.linalg.norm(across, axis=1, keepdims=True)
+    other = np.cross(normals, across)
+    corners = np.stack([points - across - other, points + across - other, points + 2 * other], axis=1).reshape(-1, 3)
+    return Mesh.of(model.name, corners, np.arange(len(corners)).reshape(-1, 3))
 
 
 def systems(names: Sequence[str]) -> dict[str, System]:
@@ -91,14 +113,13 @@ def systems(names: Sequence[str]) -> dict[str, System]:
 def available_rivals() -> list[str]:
     """The rivals installed here; none where `benchmarks.rivals` itself is not."""
     try:
-        from benchmarks import rivals
-    except ImportError:
+        return list(import_module("benchmarks.rivals").available())
+    except ModuleNotFoundError:
         return []
-    return list(rivals.available())
 
 
 def retries(parameters: Parameters) -> list[Parameters]:
-    """4.3: what the paper did after a failure: more time; then a lower λs as well; a higher one where several were found."""
+    """4.3: what the paper did after a failure: more time, a lower λs as well, a higher one where several were found."""
     search = parameters.search
     longer = replace(search, time_limit_s=None if search.time_limit_s is None else 2.0 * search.time_limit_s)
     ratio = search.overlap_ratio

@@ -30,8 +30,7 @@ class Branch:
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Which of N points (N, 3), model frame, are in it."""
-        inside: NDArray[np.bool_] = ((points >= self.low) & (points <= self.high)).all(axis=1)
-        return inside
+        return np.all((points >= self.low) & (points <= self.high), axis=1)
 
     def along(self) -> int:
         """The axis of its longest side."""
@@ -60,7 +59,8 @@ class Target:
 
     def branch_of(self, points: Floats) -> NDArray[np.int64]:
         """Which branch each of N points (N, 3), model frame, is part of, (N,)."""
-        return np.argmax([branch.holds(points) for branch in self.branches], axis=0)
+        holds = np.array([branch.holds(points) for branch in self.branches])
+        return holds.argmax(axis=0)
 
 
 @cache
