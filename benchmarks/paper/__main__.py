@@ -7,15 +7,18 @@ python -m benchmarks.paper --seeds 0-4 --experiments clutter --targets PS --out 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import cyclopts
 
 from benchmarks.common import RESULTS, median, seeds_of
 from benchmarks.paper.definitions import is_right
-from benchmarks.paper.experiments import EXPERIMENTS, Case, cases
+from benchmarks.paper.experiments import EXPERIMENTS, Case, Missing, cases
 from benchmarks.paper.rows import Ledger, Row, error_of, judged
+from benchmarks.paper.sets import DATA, set_cases
 from benchmarks.paper.systems import OURS, System, retries, scanfind_with, systems
 from benchmarks.paper.targets import target
 from scanfind.errors import ScanfindError
@@ -23,8 +26,9 @@ from scanfind.errors import ScanfindError
 
 def main(
     seeds: str = "5000-5019", experiments: str = ",".join(EXPERIMENTS), targets: str = "PS,BF",
-    system: str = "scanfind,sharif2017,rivals", rows: str = "", out: Path = RESULTS, *, fresh: bool = False,
-    date: str = "",
+    system: str = "scanfind,sharif2017,rivals", rows: str = "",
+    set_name: Annotated[str, cyclopts.Parameter("--set")] = "", data: Path = DATA, out: Path = RESULTS, *,
+    fresh: bool = False, date: str = "",
 ) -> None:  # fmt: skip
     """Run the paper's experiments; rows already there are not run again.
 
@@ -33,26 +37,42 @@ def main(
     :param targets: PS (pipe spool), BF (box frame).
     :param system: scanfind, sharif2017, a rival's name, or rivals for all that are installed.
     :param rows: only rows of these names, such as 51.295,500.
+    :param set_name: instead of the experiments: milk_kinect, pump_e57 or a folder; see the head of benchmarks/paper/sets.py.
+    :param data: folder that holds milk_kinect and pump_e57.
     :param out: folder for paper_<system>.csv.
     :param fresh: replace what is there.
     :param date: written to the CSV.
     """
     chosen, only = systems(system.split(",")), rows.split(",") if rows else []
-    ledgers = {name: Ledger(out / f"paper_{name}.csv", date, fresh) for name in chosen}
-    for key in targets.split(","):
-        for seed in seeds_of(seeds):
+    stem = f"paper_set_{Path(set_name).resolve().name}" if set_name else "paper"
+    ledgers = {name: Ledger(out / f"{stem}_{name}.csv", date, fresh) for name in chosen}
 
-            def missing(experiment: str, row: str, run: int, key: str = key, seed: int = seed) -> bool:
-                wanted = not only or row in only
-                return wanted and any((experiment, key, row, seed, run) not in one.keys for one in ledgers.values())
+    def missing(experiment: str, key: str, row: str, seed: int, run: int) -> bool:
+        if only and row not in only:
+            return False
+        return any((experiment, key, row, seed, run) not in ledger.keys for ledger in ledgers.values())
 
-            for case in cases(experiments.split(","), target(key), seed, missing):
-                for name, ledger in ledgers.items():
-                    if (case.experiment, key, case.row, seed, case.run) not in ledger.keys:
-                        ledger.add(row := ask(case, name, chosen[name]))
-                        print(told(row), file=sys.stderr, flush=True)
+    for case in wanted(seeds_of(seeds), experiments.split(","), targets.split(","), set_name, data, missing):
+        for name, ledger in ledgers.items():
+            if case.key() not in ledger.keys:
+                ledger.add(row := ask(case, name, chosen[name]))
+                print(told(row), file=sys.stderr, flush=True)
     for name, ledger in ledgers.items():
         print(*summary(name, ledger.rows), sep="\n")
+
+
+def wanted(
+    seeds: Sequence[int], experiments: Sequence[str], targets: Sequence[str], set_name: str, data: Path,
+    missing: Missing,
+) -> Iterator[Case]:  # fmt: skip
+    """The cases asked for that some system has not answered yet."""
+    if set_name:
+        for seed in seeds:
+            yield from (case for case in set_cases(set_name, data, seed) if missing(*case.key()))
+        return
+    for key in targets:
+        for seed in seeds:
+            yield from cases(experiments, target(key), seed, missing)
 
 
 def ask(case: Case, name: str, system: System) -> Row:

@@ -102,5 +102,7 @@ def model_points(model: Mesh | CloudModel) -> Floats:
 
 
 def _rms(distances: NDArray[np.float32]) -> float:
+    if not len(distances):
+        return float("nan")
     far = np.where(np.isnan(distances), FARTHEST_M, distances).astype(np.float64)
     return float(np.sqrt(np.mean(far**2)))

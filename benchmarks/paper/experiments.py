@@ -22,6 +22,9 @@ MORE_COMPLETENESS = (0.5, 0.4, 0.3)
 RUNS_PER_SCENE = 5
 BRANCHES = 3  # stream of chance
 
+Key = tuple[str, str, str, int, int]
+Missing = Callable[[str, str, str, int, int], bool]
+
 
 @dataclass(frozen=True, eq=False)
 class Case:
@@ -44,6 +47,10 @@ class Case:
     model: Mesh | CloudModel
     others: tuple[Pose, ...] = ()
     right_mm: float = RIGHT_MM
+
+    def key(self) -> Key:
+        """What it is about: experiment, target, row, seed, run."""
+        return (self.experiment, self.target, self.row, self.seed, self.run)
 
 
 class Scenes:
@@ -120,14 +127,12 @@ EXPERIMENTS: dict[str, Callable[[Target], list[Row]]] = {
 }
 
 
-def cases(
-    experiments: Sequence[str], target: Target, seed: int, wanted: Callable[[str, str, int], bool]
-) -> Iterator[Case]:
-    """The cases of a seed; only scenes that something is `wanted` of (experiment, row, run) are made."""
+def cases(experiments: Sequence[str], target: Target, seed: int, missing: Missing) -> Iterator[Case]:
+    """The cases of a target and seed that are `missing`; scenes of no such case are not made."""
     scenes = Scenes(target, seed)
     for experiment in experiments:
         for row in EXPERIMENTS[experiment](target):
-            runs = [run for run in range(row.runs) if wanted(experiment, row.name, run)]
+            runs = [run for run in range(row.runs) if missing(experiment, target.key, row.name, seed, run)]
             if not runs:
                 continue
             cloud = row.cut(scenes)

@@ -18,14 +18,13 @@ from benchmarks.paper.definitions import (
     rms_paper,
     rms_surface,
 )
-from benchmarks.paper.experiments import Case
+from benchmarks.paper.experiments import Case, Key
 from benchmarks.paper.systems import Answer, surface_of
 from scanfind.errors import UsageError
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose
 
 NAN = float("nan")
-Key = tuple[str, str, str, int, int]
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,8 @@ def judged(case: Case, system: str, answer: Answer) -> Row:
     """
     cloud = case.cloud
     instances = 1 + len(case.others)
-    poses, cuts = (each[: instances if answer.ranked else None] for each in (answer.poses, answer.isolated))
+    poses = answer.poses[: instances if answer.ranked else None]
+    cuts = answer.isolated[: len(poses)]
     errors = [error_of(pose, case) for pose in poses[:instances]]
     best = min(range(len(errors)), key=lambda k: errors[k].mm, default=-1)
     error = errors[best] if best >= 0 else PoseError(NAN, NAN)

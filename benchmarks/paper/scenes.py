@@ -40,7 +40,7 @@ class Cloud:
     xyz : (N, 3) metres; station : (N,) which scanner saw each; on_object : (N,) whether it is on the target
     order : (N,) a random rank, the same for all cuts of a scene: thinned scenes are subsets of one another
     distance : (N,) to the target's surface, metres; branch : (N,) of the target, -1 for clutter
-    origins : (S, 3) where the scanners stood; truth : scene_from_model
+    origins : (S, 3) where the scanners stood, None where nobody knows; truth : scene_from_model
     """
 
     xyz: Floats
@@ -49,7 +49,7 @@ class Cloud:
     order: Ints
     distance: Floats
     branch: Ints
-    origins: Floats
+    origins: Floats | None
     truth: Pose
 
     def __len__(self) -> int:
@@ -66,14 +66,19 @@ class Cloud:
         """|s|."""
         return int(self.on_object.sum())
 
+    def marked(self, on_object: NDArray[np.bool_], truth: Pose) -> Cloud:
+        """The same scene with another object to be found."""
+        return replace(self, on_object=on_object, truth=truth)
+
     def stations(self) -> list[PointCloud]:
         """As scanfind takes them; attribute `point` is a point's number here."""
-        rows = [np.flatnonzero(self.station == k) for k in range(len(self.origins))]
-        return [
-            PointCloud(self.xyz[row], {"point": row}, at)
-            for row, at in zip(rows, self.origins, strict=True)
-            if len(row)
-        ]
+        clouds = []
+        for k in range(int(self.station.max(initial=0)) + 1):
+            row = np.flatnonzero(self.station == k)
+            if len(row):
+                at = None if self.origins is None else self.origins[k]
+                clouds.append(PointCloud(self.xyz[row], {"point": row}, at))
+        return clouds
 
 
 def thinned(cloud: Cloud, count: int) -> Cloud:

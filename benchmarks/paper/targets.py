@@ -30,7 +30,8 @@ class Branch:
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Which of N points (N, 3), model frame, are in it."""
-        return np.all((points >= self.low) & (points <= self.high), axis=1)
+        inside: NDArray[np.bool_] = ((points >= np.array(self.low)) & (points <= np.array(self.high))).all(axis=1)
+        return inside
 
     def along(self) -> int:
         """The axis of its longest side."""
@@ -60,7 +61,8 @@ class Target:
     def branch_of(self, points: Floats) -> NDArray[np.int64]:
         """Which branch each of N points (N, 3), model frame, is part of, (N,)."""
         holds = np.array([branch.holds(points) for branch in self.branches])
-        return holds.argmax(axis=0)
+        first: NDArray[np.int64] = holds.argmax(axis=0)
+        return first
 
 
 @cache
