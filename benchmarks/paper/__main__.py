@@ -37,7 +37,7 @@ def main(
     :param targets: PS (pipe spool), BF (box frame).
     :param system: scanfind, sharif2017, a rival's name, or rivals for all that are installed.
     :param rows: only rows of these names, such as 51.295,500.
-    :param set_name: instead of the experiments: milk_kinect, pump_e57 or a folder; see the head of benchmarks/paper/sets.py.
+    :param set_name: instead of the experiments: milk_kinect, pump_e57, or a folder as benchmarks/paper/sets.py says.
     :param data: folder that holds milk_kinect and pump_e57.
     :param out: folder for paper_<system>.csv.
     :param fresh: replace what is there.

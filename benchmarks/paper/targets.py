@@ -30,8 +30,7 @@ class Branch:
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Which of N points (N, 3), model frame, are in it."""
-        inside: NDArray[np.bool_] = ((points >= np.array(self.low)) & (points <= np.array(self.high))).all(axis=1)
-        return inside
+        return np.asarray(((points >= self.low) & (points <= self.high)).all(axis=1), dtype=np.bool_)
 
     def along(self) -> int:
         """The axis of its longest side."""
