@@ -63,7 +63,7 @@ def least(
         for key, table in zip(keys, tables, strict=True)
         for name in {row.row: None for row in table if asked(row.asked)}
     }
-    ratios = sorted({row.asked for table in tables for row in table if asked(row.asked)})
+    ratios = sorted({row.asked for table in tables for row in table if asked(row.asked) and not math.isnan(row.asked)})
     at = (
         "" if experiment == "branch" or not ratios else f" at {ratios[0]:g}" + f" to {ratios[-1]:g}" * (len(ratios) > 1)
     )
@@ -113,7 +113,8 @@ def seconds(results: Results) -> Claim:
         return Claim("time a row, with isolation", f"median ≤ {SECONDS} s", "not measured", None)
     worst = max(rows, key=lambda one: rows[one])
     within = sum(value <= SECONDS for value in rows.values())
-    told = f"{within} of {len(rows)} rows; worst {rows[worst]:.2f} s ({worst}), median row {median([*rows.values()]):.2f} s"
+    typical = median([*rows.values()])
+    told = f"{within} of {len(rows)} rows; worst {rows[worst]:.2f} s ({worst}), median row {typical:.2f} s"
     return Claim("time a row, with isolation", f"median ≤ {SECONDS} s", told, within == len(rows))
 
 
@@ -192,3 +193,10 @@ def name(group: Sequence[Row]) -> str:
 
 def _told(value: float, unit: str, held: bool) -> tuple[str, bool | None]:
     return ("not measured", None) if math.isnan(value) else (f"{value:.2f} {unit}", held)
+
+
+def _span(ratios: Sequence[float]) -> str:
+    """Of which rows, in words."""
+    if not ratios:
+        return ""
+    return f" at {ratios[0]:g}" + (f" to {ratios[-1]:g}" if len(ratios) > 1 else "")

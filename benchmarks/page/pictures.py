@@ -40,7 +40,7 @@ def draw(folder: Path, seed: int) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for name, (experiment, rows) in FIGURES.items():
-        shown = [case for case in cases([experiment], target("PS"), seed, lambda *key, rows=rows: key[2] in rows)]
+        shown = list(cases([experiment], target("PS"), seed, lambda *key, rows=rows: key[2] in rows))
         shown.sort(key=lambda case: rows.index(case.row))
         figure, axes = plt.subplots(2, len(rows), figsize=(3.0 * len(rows), 5.0), layout="constrained")
         for case, (above, below) in zip(shown, axes.T, strict=True):
@@ -57,7 +57,9 @@ def panel(case: Case, answer: Answer, above: Axes, below: Axes) -> None:
     cloud = case.cloud
     centre = cloud.truth.move(target("PS").mesh.vertices).mean(axis=0)
     near = np.abs(cloud.xyz - centre).max(axis=1) < AROUND_M
-    dots(above, cloud.xyz[near] - centre, "#9a9a9a", 0.15)
+    # Thin scenes in thicker dots, or nothing is seen of them.
+    size = min(6.0, 0.3 * target("PS").scene_points / len(cloud))
+    dots(above, cloud.xyz[near] - centre, "#808080", size)
     for axis in (above, below):
         axis.set_aspect("equal")
         axis.set_axis_off()

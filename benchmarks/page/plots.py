@@ -1,10 +1,10 @@
-"""RR and time against density, clutter and completeness: one curve a system, as SVG that comes out the same each time."""
+"""RR and time against density, clutter and completeness, one curve a system: SVG that comes out the same each time."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from benchmarks.page.results import FIRST, PAPER, RATIOS, TABLES, TARGETS, Results, middle, printed
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 # Letters stay letters and names of parts do not change: equal rows give equal files.
-STYLE = {"svg.fonttype": "none", "svg.hashsalt": "scanfind", "font.size": 8, "axes.spines.top": False,
+STYLE: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "scanfind", "font.size": 8, "axes.spines.top": False,
          "axes.spines.right": False, "path.simplify": False}  # fmt: skip
 COLOURS = {FIRST[0]: "#0b5fa5", FIRST[1]: "#6fb0e6", PAPER: "#c0392b"}
 OTHERS = ("#7f7f7f", "#2e8b57", "#b8860b", "#8e44ad", "#d2691e", "#20b2aa", "#999933", "#444444")
@@ -35,12 +35,14 @@ def draw(results: Results, folder: Path) -> list[Path]:
                 left.set_title(f"{noun}: recognition rate", loc="left")
                 right.set_title(f"{noun}: seconds", loc="left")
                 for axis in (left, right):
-                    axis.set_xscale("log")
+                    axis.set_xscale("linear" if experiment == "completeness" else "log")
                     axis.set_xlabel(RATIOS[experiment].replace("_", " "))
                 left.set_ylim(-0.05, 1.05)
                 right.set_yscale("log")
             handles = {
-                label: h for axis in axes.flat for h, label in zip(*axis.get_legend_handles_labels(), strict=True)
+                label: handle
+                for axis in axes.flat
+                for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
             }
             if handles:
                 figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, frameon=False)
@@ -51,23 +53,17 @@ def draw(results: Results, folder: Path) -> list[Path]:
 
 
 def curves(results: Results, experiment: str, key: str, left: Axes, right: Axes) -> None:
-    """Medians over all scenes, a failure counting as RR 0 where nothing was isolated; the paper's own, failures as 0."""
-    theirs = printed(experiment, key)
-    points = [
-        (float(name), one.rr if one.success or math.isnan(one.rr) else 0.0, one.seconds) for name, one in theirs.items()
-    ]
-    lines = {PAPER: sorted(points)}
+    """Medians over all scenes against the ratio asked for, and the paper's own, a failure being an RR of 0."""
+    lines = {PAPER: sorted((float(name), one.rr, one.seconds) for name, one in printed(experiment, key).items())}
     for system in results.systems(experiment, key):
-        groups = [results.of(system, experiment, key, row) for row in results.row_names(experiment, key)]
-        lines[system] = sorted(
-            (group[0].asked, middle(group, lambda r: r.rr), middle(group, lambda r: r.total_s))
-            for group in groups
-            if group
-        )
+        groups = (results.of(system, experiment, key, row) for row in results.row_names(experiment, key))
+        found = [group for group in groups if group]
+        medians = ((rows[0].asked, middle(rows, lambda r: r.rr), middle(rows, lambda r: r.total_s)) for rows in found)
+        lines[system] = sorted(medians)
     spare = iter(OTHERS * len(lines))
     for system, line in lines.items():
-        x, rr, seconds = zip(*line, strict=True)
-        look = {"label": system, "color": COLOURS.get(system) or next(spare), "marker": "o", "markersize": 3.0}
+        ratio, rr, seconds = zip(*line, strict=True)
+        look: dict[str, Any] = {"label": system, "color": COLOURS.get(system) or next(spare), "marker": "o"}
         if not all(math.isnan(value) for value in rr):
-            left.plot(x, rr, **look)
-        right.plot(x, seconds, **look)
+            left.plot(ratio, rr, markersize=3.0, **look)
+        right.plot(ratio, seconds, markersize=3.0, **look)

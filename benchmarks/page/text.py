@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from operator import attrgetter
 
 from benchmarks.common import STAGES
 from benchmarks.page.held import OURS, claims, ratio_of
-from benchmarks.page.results import PAPER, TABLES, TARGETS, Results, middle, printed, success
+from benchmarks.page.results import PAPER, TABLES, TARGETS, Printed, Results, middle, printed, success
+from benchmarks.paper.rows import Row
 from benchmarks.paper.targets import paper
 
 HEAD = """# Benchmarks: the paper's tables
 
-Sharif, Nahangi, Haas & West, "Automated Model-Based Finding of 3D Objects in Cluttered Construction Point Cloud Models"
-(2017), Tables 5 to 12, on scenes that anybody can make again. This page is made from `benchmarks/results/paper_*.csv` by
+Sharif, Nahangi, Haas & West, "Automated Model-Based Finding of 3D Objects in Cluttered Construction Point Cloud
+Models" (2017), Tables 5 to 12, on scenes that anybody can make again. This page is made from the rows by
 `make page`; nothing in it is typed. `make paper` makes the rows, `make paper-quick` a few of them in minutes;
 [benchmarks/README.md](../benchmarks/README.md) has the definitions, what the scenes are, and the columns.
 """
@@ -56,10 +58,8 @@ Scene (grey), the model where it was found (orange), and below it the isolated p
 def origin(results: Results) -> str:
     """Where the rows come from."""
     lines = ["## Where the rows come from\n"]
-    lines += [
-        f"- {system}: {len(results.rows[system])} rows; {'; '.join(results.comments[system])}"
-        for system in results.rows
-    ]
+    for system, rows in results.rows.items():
+        lines.append(f"- {system}: {len(rows)} rows; {'; '.join(results.comments[system])}")
     return "\n".join(lines) + "\n"
 
 
@@ -93,33 +93,39 @@ def by_system(results: Results, experiment: str, key: str) -> str:
 
 
 def in_detail(results: Results, experiment: str, key: str) -> str:
-    """Everything about scanfind's rows: medians over all scenes, errors over those found; the paper's RR and RMS beside."""
-    rows = []
-    for row in results.row_names(experiment, key):
-        mine = results.of(OURS, experiment, key, row)
-        if not mine:
-            continue
-        one = printed(experiment, key).get(row)
-        stages = [_number(middle(mine, lambda r, s=stage: getattr(r, f"{s}_s")), 2) for stage in STAGES]
-        rows.append(
-            [
-                row, f"{len(mine)}", f"{middle(mine, lambda r: r.scene_points):.0f}",
-                f"{middle(mine, lambda r: r.object_points):.0f}", f"{success(mine):.2f}",
-                f"{sum(r.false for r in mine)}", _number(middle(mine, lambda r: r.rr), 3), _number(one.rr if one else math.nan, 3),
-                _number(middle(mine, lambda r: r.precision), 3), _number(middle(mine, lambda r: r.rms_cm), 2),
-                _number(one.rms_cm if one else math.nan, 2), _number(middle(mine, lambda r: r.rms_surface_mm), 2),
-                _number(middle([r for r in mine if r.success], lambda r: r.error_mm), 2),
-                _number(middle([r for r in mine if r.success], lambda r: r.error_deg), 3), *stages,
-                _number(middle(mine, lambda r: r.total_s), 2),
-            ]
-        )  # fmt: skip
-    if not rows:
-        return ""
+    """All about scanfind's rows: medians over all scenes, of errors over those found; the paper's RR and RMS beside."""
     head = [
         experiment, "scenes", "points", "on object", "success", "false", "RR", "paper", "precision", "RMS cm", "paper",
         "to surface mm", "pose mm", "pose °", *(f"{stage} s" for stage in STAGES), "total s",
     ]  # fmt: skip
-    return f"\n{OURS} in detail, medians:\n\n" + table(head, rows)
+    rows = [
+        [name, *details(mine, printed(experiment, key).get(name))]
+        for name in results.row_names(experiment, key)
+        if (mine := results.of(OURS, experiment, key, name))
+    ]
+    return f"\n{OURS} in detail, medians:\n\n" + table(head, rows) if rows else ""
+
+
+def details(rows: Sequence[Row], theirs: Printed | None) -> list[str]:
+    """The cells of a row of the table above, after its name."""
+    right = [row for row in rows if row.success]
+    return [
+        f"{len(rows)}",
+        f"{middle(rows, lambda r: r.scene_points):.0f}",
+        f"{middle(rows, lambda r: r.object_points):.0f}",
+        f"{success(rows):.2f}",
+        f"{sum(row.false for row in rows)}",
+        _number(middle(rows, lambda r: r.rr), 3),
+        _number(theirs.rr if theirs else math.nan, 3),
+        _number(middle(rows, lambda r: r.precision), 3),
+        _number(middle(rows, lambda r: r.rms_cm), 2),
+        _number(theirs.rms_cm if theirs else math.nan, 2),
+        _number(middle(rows, lambda r: r.rms_surface_mm), 2),
+        _number(middle(right, lambda r: r.error_mm), 2),
+        _number(middle(right, lambda r: r.error_deg), 3),
+        *(_number(middle(rows, attrgetter(f"{stage}_s")), 2) for stage in STAGES),
+        _number(middle(rows, lambda r: r.total_s), 2),
+    ]
 
 
 def effectiveness(results: Results) -> str:
