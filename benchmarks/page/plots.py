@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 # Letters stay letters and names of parts do not change: equal rows give equal files.
 STYLE: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "scanfind", "font.size": 8, "axes.spines.top": False,
          "axes.spines.right": False, "path.simplify": False}  # fmt: skip
+# From a tenth of what is asked of scanfind to what is left a rival, and its preparation.
+SECONDS = (0.05, 120.0)
 COLOURS = {FIRST[0]: "#0b5fa5", FIRST[1]: "#6fb0e6", PAPER: "#c0392b"}
 OTHERS = ("#7f7f7f", "#2e8b57", "#b8860b", "#8e44ad", "#d2691e", "#20b2aa", "#999933", "#444444")
 
@@ -29,16 +31,19 @@ def draw(results: Results, folder: Path) -> list[Path]:
     paths = []
     for experiment in TABLES:
         with mpl.rc_context(STYLE):
-            figure, axes = plt.subplots(2, 2, figsize=(8.0, 5.4), layout="constrained")
+            figure, axes = plt.subplots(2, 2, figsize=(8.0, 5.4), layout="constrained", sharex="all")
             for (key, noun), (left, right) in zip(TARGETS.items(), axes, strict=True):
                 curves(results, experiment, key, left, right)
                 left.set_title(f"{noun}: recognition rate", loc="left")
                 right.set_title(f"{noun}: seconds", loc="left")
                 for axis in (left, right):
                     axis.set_xscale("linear" if experiment == "completeness" else "log")
+                    axis.xaxis.set_major_formatter("{x:g}")
                     axis.set_xlabel(RATIOS[experiment].replace("_", " "))
                 left.set_ylim(-0.05, 1.05)
                 right.set_yscale("log")
+                right.set_ylim(SECONDS)
+                right.yaxis.set_major_formatter("{x:g}")
             handles = {
                 label: handle
                 for axis in axes.flat

@@ -9,6 +9,7 @@ from operator import attrgetter
 from benchmarks.common import STAGES
 from benchmarks.page.held import OURS, claims, ratio_of
 from benchmarks.page.results import PAPER, TABLES, TARGETS, Printed, Results, middle, printed, success
+from benchmarks.paper.experiments import PUBLICATION_SEEDS
 from benchmarks.paper.rows import Row
 from benchmarks.paper.targets import paper
 
@@ -59,7 +60,8 @@ def origin(results: Results) -> str:
     """Where the rows come from."""
     lines = ["## Where the rows come from\n"]
     for system, rows in results.rows.items():
-        lines.append(f"- {system}: {len(rows)} rows; {'; '.join(results.comments[system])}")
+        tuned = "; **seeds that were tuned on**" if min(row.seed for row in rows) < PUBLICATION_SEEDS else ""
+        lines.append(f"- {system}: {len(rows)} rows; {'; '.join(results.comments[system])}{tuned}")
     return "\n".join(lines) + "\n"
 
 

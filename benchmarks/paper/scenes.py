@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from benchmarks.common import Floats
 from benchmarks.paper.targets import Target
 from scanfind.cloud import PointCloud
+from scanfind.errors import UsageError
 from scanfind.near_surface import near_triangles, signed_distances
 from scanfind.pose import Pose
 from scanfind.simulate import furniture
@@ -29,8 +30,11 @@ SCAN, THIN = 0, 1
 SPARE = 1.15
 # A shop of at most this clutter shows the target as densely as the paper's scan did with 1.1 million points at most.
 MOST_RAW_CLUTTER = 180.0
-HALL_BAYS = (5, 4)
-BAYS_MADE = 8
+# 3 stations that give the target one point in 60, and 2 in each of the 19 other bays: a clutter ratio of 800.
+HALL_BAYS, STATIONS_A_BAY = (5, 4), 2
+LEAST_BAY_CLUTTER = 60.0
+# Furnished bays that are made; the hall has each of them several times.
+BAYS_MADE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +96,7 @@ def cropped(cloud: Cloud, ratio: float) -> Cloud:
     count = round(ratio * cloud.object_points())
     if count > len(clutter):
         msg = f"a clutter ratio of {ratio} needs {count} points of clutter, the scene has {len(clutter)}"
-        raise ValueError(msg)
+        raise UsageError(msg)
     nearest = clutter[np.argsort(cloud.distance[clutter], kind="stable")[:count]]
     return cloud.take(np.sort(np.concatenate([np.flatnonzero(cloud.on_object), nearest])))
 
@@ -103,7 +107,7 @@ def sized(cloud: Cloud, ratio: float, scene_points: int) -> Cloud:
     ranks = np.sort(cloud.order[cloud.on_object])
     if wanted > len(ranks):
         msg = f"{wanted} points on the target are asked for, the scan has {len(ranks)}"
-        raise ValueError(msg)
+        raise UsageError(msg)
     return cropped(cloud.take(cloud.order <= ranks[wanted - 1]), (scene_points - wanted) / wanted)
 
 
@@ -112,7 +116,8 @@ def paper_scene(target: Target, seed: int) -> Cloud:
     least = (target.clutter_ratio * 1.05, MOST_RAW_CLUTTER)
     scene = shop(seed, target.mesh, clutter=least)
     on_object = target.object_points(target.clutter_ratio, target.scene_points)
-    return sized(scanned(target, scene, seed, on_object), target.clutter_ratio, target.scene_points)
+    share = float(shares(scene.caster(), scene.stations, PILOT)[scene.target_ids()[0]])
+    return sized(scanned(target, scene, seed, on_object, share), target.clutter_ratio, target.scene_points)
 
 
 def hall_scene(target: Target, seed: int, least_ratio: float, object_points: int) -> Cloud:
@@ -121,22 +126,22 @@ def hall_scene(target: Target, seed: int, least_ratio: float, object_points: int
     The hall is scanned until it has `object_points` on the target; stations are added, bay after bay, until the clutter
     ratio is at least `least_ratio`.
     """
-    bay = shop(seed, target.mesh, clutter=(20.0, MOST_RAW_CLUTTER))
+    bay = shop(seed, target.mesh, clutter=(LEAST_BAY_CLUTTER, MOST_RAW_CLUTTER))
     scene = hall(bay, seed)
-    own, caster = len(bay.stations), scene.caster()
-    count = own
-    while count < len(scene.stations):
-        share = shares(caster, scene.stations[:count], PILOT)[scene.target_ids()[0]]
-        if share * least_ratio * SPARE <= 1.0 - share:
+    caster, target_id = scene.caster(), scene.target_ids()[0]
+    seen: list[float] = []
+    for at in scene.stations:
+        # Each meets a wall with nearly every beam, so that their shares have equal weight.
+        seen.append(float(shares(caster, at[None], PILOT)[target_id]))
+        if len(seen) >= len(bay.stations) and np.mean(seen) * (1.0 + least_ratio) * SPARE <= 1.0:
             break
-        count += 1
-    return scanned(target, Scene(scene.objects, scene.stations[:count]), seed, object_points)
+    used = Scene(scene.objects, scene.stations[: len(seen)])
+    return scanned(target, used, seed, object_points, float(np.mean(seen)))
 
 
-def scanned(target: Target, scene: Scene, seed: int, object_points: int) -> Cloud:
-    """A scan with at least `object_points` on the target."""
+def scanned(target: Target, scene: Scene, seed: int, object_points: int, share: float) -> Cloud:
+    """A scan with at least `object_points` on the target, which gets about `share` of all."""
     target_id = scene.target_ids()[0]
-    share = shares(scene.caster(), scene.stations, PILOT)[target_id]
     points = round(SPARE * object_points / share)
     taken = scan(scene, scanner=FARO, seed=seed, points=points)
     while (had := len(taken.points_on(target_id))) < object_points:
@@ -164,25 +169,26 @@ def scanned(target: Target, scene: Scene, seed: int, object_points: int) -> Clou
 def hall(bay: Scene, seed: int) -> Scene:
     """A hall of HALL_BAYS shops with `bay` in one of the middle ones and other furniture and spools in the others.
 
-    The bays' own stations come first, then one in each other bay, in random order.
+    The bay's own stations come first, then those of the others, in random order.
     """
     rng = np.random.default_rng([seed, 2])
     across, along = HALL_BAYS
     places = [(i, j) for i in range(across) for j in range(along)]
     middle = (across // 2, along // 2)
     made = [furnished((seed, 1000 + k)) for k in range(BAYS_MADE)]
-    objects, stations = [], [bay.stations + _shift(middle)]
     offices = [(furniture.office(*OFFICE_M, SHOP_M[2]), _at(place, SHOP_M[:2])) for place in places]
     walls = furniture.hall(SHOP_M[0] * across, SHOP_M[1] * along, SHOP_M[2])
     room = assemble("room", [(walls, Pose.identity()), *offices])
-    objects.append(SceneObject("room", room, Pose.identity(), bay.objects[0].reflectance))
+    objects = [SceneObject("room", room, Pose.identity(), bay.objects[0].reflectance)]
     objects += [replace(thing, pose=_at(middle) @ thing.pose) for thing in bay.objects[1:]]
-    others = [place for place in places if place != middle]
-    for place in (others[k] for k in rng.permutation(len(others))):
+    standings = []
+    for place in places:
+        if place == middle:
+            continue
         layout = made[int(rng.integers(len(made)))]
         objects += [replace(thing, pose=_at(place) @ thing.pose) for thing in layout.objects[1:]]
-        stations.append(standing(layout, rng)[None] + _shift(place))
-    return Scene(tuple(objects), np.concatenate(stations))
+        standings += [standing(layout, rng) + _shift(place) for _ in range(STATIONS_A_BAY)]
+    return Scene(tuple(objects), np.concatenate([bay.stations + _shift(middle), rng.permutation(standings)]))
 
 
 def furnished(seed: tuple[int, int]) -> Layout:
