@@ -402,7 +402,7 @@ def test_the_worst_row_decides(found: int, held: bool) -> None:
 def test_a_rival_counts_where_it_succeeds_as_often() -> None:
     ours = rows_with([1] * 4, "5", 5.0)
     slow = [replace(row, system="slow", total_s=5.0, error_mm=6.0) for row in ours]
-    lucky = [replace(row, system="lucky", total_s=0.3, success=int(row.seed == 0)) for row in ours]
+    lucky = [replace(row, system="lucky", total_s=0.3, error_mm=2.0, success=int(row.seed == 0)) for row in ours]
     ours = [replace(row, error_mm=1.0) for row in ours]
     told = {one.what: one for one in claims(Results({"scanfind": ours, "slow": slow, "lucky": lucky}, {}))}
     assert told["time against rivals"].measured.startswith("20.0 × (slow")
