@@ -14,7 +14,7 @@ from benchmarks.page.held import claims
 from benchmarks.page.results import Results, printed, read
 from benchmarks.page.text import page
 from benchmarks.paper import __main__ as command
-from benchmarks.paper import definitions, experiments, rows, sets
+from benchmarks.paper import definitions, experiments, rows, scenes, sets
 from benchmarks.paper.experiments import EXPERIMENTS, Case, Missing, Scenes
 from benchmarks.paper.scenes import Cloud, cropped, sized, thinned
 from benchmarks.paper.systems import Answer
@@ -172,11 +172,11 @@ def test_stations_hold_every_point_once_by_its_number() -> None:
 def test_removing_branches_meets_the_ratio_and_leaves_the_clutter() -> None:
     cloud = small_cloud(on_object=800)
     numbers = np.where(cloud.on_object, np.arange(len(cloud)) % len(target("PS").branches), -1)
-    scenes = Scenes(target("PS"), seed=3)
-    scenes.__dict__["full"] = replace(cloud, branch=numbers)
+    made = Scenes(target("PS"), seed=3)
+    made.__dict__["full"] = replace(cloud, branch=numbers)
     for row in EXPERIMENTS["completeness"](target("PS")):
-        cut = row.cut(scenes)
-        assert row.had(cut, scenes) == pytest.approx(row.asked, abs=1 / 800)
+        cut = row.cut(made)
+        assert row.had(cut, made) == pytest.approx(row.asked, abs=1 / 800)
         assert (~cut.on_object).sum() == (~cloud.on_object).sum()
 
 
@@ -301,14 +301,15 @@ def test_every_experiment_runs_end_to_end(tmp_path: Path, monkeypatch: pytest.Mo
     assert [row.scene_points for row in found if row.experiment == "density"] == [200_000]
 
 
-@pytest.mark.slow
-def test_a_hall_has_clutter_for_every_row() -> None:
-    one = target("PS")
-    scenes = Scenes(one, seed=0)
-    for row in EXPERIMENTS["clutter"](one)[-3:]:
-        cut = row.cut(scenes)
-        assert len(cut) == one.scene_points
-        assert row.had(cut, scenes) == pytest.approx(row.asked, rel=1e-3)
+def test_a_hall_has_the_clutter_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scenes, "HALL_BAYS", (2, 1))
+    monkeypatch.setattr(scenes, "BAYS_MADE", 1)
+    hall = scenes.hall_scene(target("PS"), seed=0, least_ratio=90.0, object_points=150)
+    assert definitions.clutter_ratio(len(hall), hall.object_points()) > 90.0
+    cut = sized(hall, 90.0, 9100)
+    assert (len(cut), cut.object_points()) == (9100, 100)
+    assert hall.origins is not None
+    assert 3 <= len(hall.origins) <= 5
 
 
 # --- sets
