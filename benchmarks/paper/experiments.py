@@ -36,6 +36,7 @@ class Case:
     asked, had : the ratio the row is about; run : which of several searches of the same scene
     model : what is sought; cloud.truth is where it is, `others` where further instances of it are
     right_mm : how far the centre of a right pose may be off
+    turn : model_from_model, after which what is left of the object looks as before, so that either pose is right
     """
 
     experiment: str
@@ -49,6 +50,7 @@ class Case:
     model: Mesh | CloudModel
     others: tuple[Pose, ...] = ()
     right_mm: float = RIGHT_MM
+    turn: Pose | None = None
 
     def key(self) -> Key:
         """What it is about: experiment, target, row, seed, run."""
@@ -75,13 +77,14 @@ class Scenes:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of a table: its name, the ratio it asks for, and how its scene comes from the seed's; runs a scene."""
+    """A row of a table: its name, the ratio it asks for, and how its scene is cut; runs a scene; turn as in Case."""
 
     name: str
     asked: float
     cut: Callable[[Scenes], Cloud]
     had: Callable[[Cloud, Scenes], float]
     runs: int = 1
+    turn: Pose | None = None
 
 
 def density(target: Target) -> list[Row]:
@@ -104,7 +107,10 @@ def clutter(target: Target) -> list[Row]:
 
 
 def completeness(target: Target) -> list[Row]:
-    """Tables 9, 10: branches removed in random order, of the last a part, until the ratio is met; clutter stays."""
+    """Tables 9, 10: branches removed in random order, of the last a part, until the ratio is met; clutter stays.
+
+    The target's telling branches are left: what is to be found must be told from itself slid along or turned over.
+    """
     of_paper = paper()[f"table{_number(target, 9)}_completeness_{target.key}"][0]["completeness_ratio"]
     ratios = sorted({*of_paper, *MORE_COMPLETENESS}, reverse=True)
     return [Row(f"{ratio:g}", ratio, partial(_incomplete, ratio), _left) for ratio in ratios]
@@ -112,7 +118,8 @@ def completeness(target: Target) -> list[Row]:
 
 def branch(target: Target) -> list[Row]:
     """Is any branch critical, as one was in Table 9? Each is removed by itself, however much of the object it is."""
-    return [Row(one.name, float("nan"), partial(_without, k), _left) for k, one in enumerate(target.branches)]
+    nan = float("nan")
+    return [Row(one.name, nan, partial(_without, k), _left, turn=one.turn) for k, one in enumerate(target.branches)]
 
 
 def effectiveness(_: Target) -> list[Row]:
@@ -140,7 +147,9 @@ def cases(experiments: Sequence[str], target: Target, seed: int, missing: Missin
             cloud = row.cut(scenes)
             had = row.had(cloud, scenes)
             for run in runs:
-                yield Case(experiment, target.key, row.name, row.asked, had, seed, run, cloud, target.mesh)
+                yield Case(
+                    experiment, target.key, row.name, row.asked, had, seed, run, cloud, target.mesh, turn=row.turn
+                )  # fmt: skip
 
 
 def _thinned(points: int, scenes: Scenes) -> Cloud:
@@ -161,7 +170,7 @@ def _incomplete(ratio: float, scenes: Scenes) -> Cloud:
     rng = np.random.default_rng([scenes.seed, BRANCHES])
     gone = np.zeros(len(cloud), dtype=bool)
     surplus = cloud.object_points() - round(ratio * cloud.object_points())
-    for number in rng.permutation(len(branches)):
+    for number in rng.permutation([k for k, one in enumerate(branches) if one.name not in scenes.target.telling]):
         points = np.flatnonzero(cloud.branch == number)
         along = cloud.truth.inverse().move(cloud.xyz[points])[:, branches[number].along()]
         from_an_end = np.argsort(along * rng.choice([-1.0, 1.0]))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from benchmarks.common import Floats
 from scanfind.mesh import Mesh
+from scanfind.pose import Pose
 from scanfind.simulate.objects import FRAME_MEMBER_M, FRAME_SIZE_M, SpoolDesign, box_frame, pipe_spool
 
 # A scanned point lies so far outside its branch's box at most: five times the range noise.
@@ -22,11 +23,15 @@ BOX_MARGIN_M = 0.015
 
 @dataclass(frozen=True)
 class Branch:
-    """A piece of an object that can be cut away: a box in the model's frame, (3,) low and (3,) high, metres."""
+    """A piece of an object that can be cut away: a box in the model's frame, (3,) low and (3,) high, metres.
+
+    turn : model_from_model, a motion after which the object without this piece looks as before; None for no such one
+    """
 
     name: str
     low: tuple[float, float, float]
     high: tuple[float, float, float]
+    turn: Pose | None = None
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Which of N points (N, 3), model frame, are in it."""
@@ -44,6 +49,8 @@ class Target:
     key : of the paper's tables, PS or BF; noun : for people
     scene_points : of the paper's fully cluttered scene; clutter_ratio : of that scene (first row of Tables 7, 8)
     branches : every point of the object is in one or more; the first has it
+    telling : branches without which too little may be left to tell a pose: a pipe slides and rolls, a frame without
+        its brace and cross member is the same turned over
     """
 
     key: str
@@ -52,6 +59,7 @@ class Target:
     scene_points: int
     clutter_ratio: float
     branches: tuple[Branch, ...]
+    telling: tuple[str, ...]
 
     def object_points(self, ratio: float, scene_points: int) -> int:
         """Equation 3 solved for |s|."""
@@ -73,12 +81,12 @@ def paper() -> dict[str, Any]:
 @cache
 def target(key: str) -> Target:
     """PS or BF."""
-    noun, mesh, branches = {
-        "PS": ("pipe spool", pipe_spool(), spool_branches(SpoolDesign())),
-        "BF": ("box frame", box_frame(), frame_branches()),
+    noun, mesh, branches, telling = {
+        "PS": ("pipe spool", pipe_spool(), spool_branches(SpoolDesign()), ("riser",)),
+        "BF": ("box frame", box_frame(), frame_branches(), ("cross", "brace")),
     }[key]
     full = paper()[{"PS": "table7_clutter_PS", "BF": "table8_clutter_BF"}[key]][0]
-    return Target(key, noun, mesh, full["scene_points"][0], full["clutter_ratio"][0], tuple(branches))
+    return Target(key, noun, mesh, full["scene_points"][0], full["clutter_ratio"][0], tuple(branches), telling)
 
 
 def spool_branches(spool: SpoolDesign) -> Sequence[Branch]:
@@ -115,4 +123,7 @@ def frame_branches() -> Sequence[Branch]:
     posts = [box(f"post_{p}{q}", (u, v, 0), (u + m, v + m, z))
              for p, u in enumerate((0, x - m)) for q, v in enumerate((0, y - m))]  # fmt: skip
     cross = box("cross", (0, 0, z / 2 - m / 2), (m, y, z / 2 + m / 2))
-    return (*longs, *ends, *posts, cross, Branch("brace", (-1.0, -1.0, -1.0), (x + 1.0, y + 1.0, z + 1.0)))
+    # Without its brace the frame is the same when it is turned over about its length.
+    over = Pose.from_rotation_vector([np.pi, 0.0, 0.0], [0.0, y, z])
+    brace = Branch("brace", (-1.0, -1.0, -1.0), (x + 1.0, y + 1.0, z + 1.0), over)
+    return (*longs, *ends, *posts, cross, brace)
