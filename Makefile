@@ -41,7 +41,9 @@ lint: $(VENV)/developed
 	$(BIN)/lint-imports
 
 paper: $(VENV)/benched
-	$(BIN)/python -m benchmarks.paper --seeds $(SEEDS)
+	$(BIN)/python -m benchmarks.paper --seeds $(SEEDS) --experiments density,clutter,completeness
+	$(BIN)/python -m benchmarks.paper --seeds $(SEEDS) --experiments effectiveness --system scanfind,sharif2017
+	$(BIN)/python -m benchmarks.paper --seeds $(SEEDS) --experiments branch --system scanfind
 	$(BIN)/python -m benchmarks.page
 
 # The preset takes all of its 20 s a scene: only the rows the paper calls typical.

@@ -104,12 +104,18 @@ def cpu_model() -> str:
 
 
 def commit() -> str:
-    """The git commit, with "+" where files differ from it; "unknown" outside a clone."""
-    described = subprocess.run(
-        ["git", "describe", "--always", "--dirty=+", "--exclude=*"],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    return described.stdout.strip() or "unknown"
+    """The git commit, with "+" where files differ from it; "unknown" outside a clone.
+
+    What benchmarks write does not count: a run that goes on is still of the commit it began with.
+    """
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!benchmarks/results", ":!docs")
+    return git("rev-parse", "--short", "HEAD") + ("+" if changed else "") or "unknown"
+
+
+def git(*arguments: str) -> str:
+    """What git says of this clone; empty where there is none."""
+    told = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
+    return told.stdout.strip()
 
 
 def _short(value: object) -> object:
