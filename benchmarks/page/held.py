@@ -21,6 +21,7 @@ TIMES_FASTER, OF_BEST_ERROR = 20.0, 1.0 / 3.0
 NOISES, OF_PAPER_RMS = 1.5, 0.2
 LEAST_FOUND = 0.5  # of a row's scenes, for its RR and precision to be asked about
 SECONDS = 0.5
+RUNS = 100
 
 
 @dataclass(frozen=True)
@@ -155,8 +156,13 @@ def effectiveness(results: Results, key: str) -> Claim:
     """Tables 11, 12: isolated means found, and nothing else with it."""
     rows = results.of(OURS, "effectiveness", key)
     ratio = ratio_of(rows)
-    measured = "not measured" if math.isnan(ratio) else f"{ratio:.2f} over {len(rows)} runs"
-    return Claim(f"effectiveness ratio, {TARGETS[key]}", "1.00", measured, None if math.isnan(ratio) else ratio == 1.0)
+    if math.isnan(ratio):
+        return Claim(f"effectiveness ratio, {TARGETS[key]}", f"1.00 over {RUNS} runs", "not measured", None)
+    # Fewer runs may miss it, but cannot show it.
+    held = False if ratio < 1.0 else True if len(rows) >= RUNS else None
+    return Claim(
+        f"effectiveness ratio, {TARGETS[key]}", f"1.00 over {RUNS} runs", f"{ratio:.2f} over {len(rows)}", held
+    )
 
 
 def ratio_of(rows: Sequence[Row]) -> float:
