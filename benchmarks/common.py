@@ -75,14 +75,19 @@ def origin_lines(seeds: str, date: str) -> list[str]:
 
 def write_csv(name: str, rows: Sequence[DataclassInstance], seeds: str, date: str, summary: Sequence[str] = ()) -> Path:
     """Rows, all of one dataclass, as results/<name>.csv below comment lines of their origin and summary; its path."""
-    RESULTS.mkdir(exist_ok=True)
-    path = RESULTS / f"{name}.csv"
-    with path.open("w", newline="", encoding="utf-8") as file:
-        file.writelines(f"# {line}\n" for line in [*origin_lines(seeds, date), *summary])
+    return write_rows(RESULTS / f"{name}.csv", rows, [*origin_lines(seeds, date), *summary])
+
+
+def write_rows(path: Path, rows: Sequence[DataclassInstance], comments: Sequence[str]) -> Path:
+    """Rows, all of one dataclass, as CSV below comment lines; all of it or, when interrupted, what was there before."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part")
+    with part.open("w", newline="", encoding="utf-8") as file:
+        file.writelines(f"# {line}\n" for line in comments)
         writer = csv.DictWriter(file, [field.name for field in fields(rows[0])], lineterminator="\n")
         writer.writeheader()
         writer.writerows({column: _short(value) for column, value in asdict(row).items()} for row in rows)
-    return path
+    return part.replace(path)
 
 
 def tell(lines: Sequence[str], path: Path) -> None:
@@ -99,12 +104,18 @@ def cpu_model() -> str:
 
 
 def commit() -> str:
-    """The git commit, with "+" where files differ from it; "unknown" outside a clone."""
-    described = subprocess.run(
-        ["git", "describe", "--always", "--dirty=+", "--exclude=*"],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    return described.stdout.strip() or "unknown"
+    """The git commit, with "+" where files differ from it; "unknown" outside a clone.
+
+    What benchmarks write does not count: a run that goes on is still of the commit it began with.
+    """
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!benchmarks/results", ":!docs")
+    return git("rev-parse", "--short", "HEAD") + ("+" if changed else "") or "unknown"
+
+
+def git(*arguments: str) -> str:
+    """What git says of this clone; empty where there is none."""
+    told = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
+    return told.stdout.strip()
 
 
 def _short(value: object) -> object:

@@ -233,7 +233,7 @@ class Search:
         """
         fine, classes = self.scene.fine, self._classes[self.scene.fine.cell_of[surfels]]
         flatness = fine.flatness[surfels]
-        clean = flatness <= np.hypot(self.scene.noise, CLEAN_CELLS * fine.cell)
+        clean: NDArray[np.bool_] = flatness <= np.hypot(self.scene.noise, CLEAN_CELLS * fine.cell)
         for shape in np.unique(classes):
             alike = classes == shape
             clean[alike] |= flatness[alike] <= np.quantile(flatness[alike], CLEAN_SHARE)

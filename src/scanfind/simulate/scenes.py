@@ -77,6 +77,13 @@ def _empty_shop(seed: tuple[int, int]) -> Layout:
     return layout
 
 
+def bay(seed: tuple[int, int], spools: int) -> Layout:
+    """A shop with everything but targets and stations."""
+    layout = _empty_shop(seed)
+    _furnish(layout, spools)
+    return layout
+
+
 def _furnish(layout: Layout, spools: int) -> None:
     """Put racks, tables, stairs, drums, crates, cable trays and other spools: as many as fit."""
     rng = layout.rngs["furniture"]

@@ -1,0 +1,157 @@
+"""The page's words and tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from operator import attrgetter
+
+from benchmarks.common import STAGES
+from benchmarks.page.held import OURS, claims, ratio_of
+from benchmarks.page.results import PAPER, TABLES, TARGETS, Printed, Results, middle, printed, success
+from benchmarks.paper.experiments import PUBLICATION_SEEDS
+from benchmarks.paper.rows import Row
+from benchmarks.paper.targets import paper
+
+HEAD = """# Benchmarks: the paper's tables
+
+Sharif, Nahangi, Haas & West, "Automated Model-Based Finding of 3D Objects in Cluttered Construction Point Cloud
+Models" (2017), Tables 5 to 12, on scenes that anybody can make again. This page is made from the rows by
+`make page`; nothing in it is typed. `make paper` makes the rows, `make paper-quick` a few of them in minutes;
+[benchmarks/README.md](../benchmarks/README.md) has the definitions, what the scenes are, and the columns.
+"""
+
+NOTES = {
+    "density": "The paper's fully cluttered scene, thinned at random to the points a ratio stands for (10,000 for 1).",
+    "clutter": "Cropped to what is nearest to the target. 100 and above: a hall of 20 bays, at the points of the full "
+    "scene, so that the target is sparser too.",
+    "completeness": "Branches of the target removed from the full scene, in an order drawn anew for each scene.",
+    "branch": "One branch or member removed at a time: is any of them critical?",
+}
+
+
+def page(results: Results) -> str:
+    """docs/benchmarks.md."""
+    parts = [HEAD, origin(results), held(results)]
+    for experiment, numbers in TABLES.items():
+        parts.append(f"## {experiment.capitalize()} (Tables {numbers[0]} and {numbers[1]})\n\n{NOTES[experiment]}\n")
+        parts.append(f"![RR and time against {experiment}](pictures/{experiment}.svg)\n")
+        parts += [by_system(results, experiment, key) + in_detail(results, experiment, key) for key in TARGETS]
+    parts.append(f"## Each branch removed\n\n{NOTES['branch']}\n")
+    parts += [by_system(results, "branch", key) for key in TARGETS]
+    parts.append(effectiveness(results))
+    parts.append(PICTURES)
+    return "\n".join(part for part in parts if part)
+
+
+PICTURES = """## As in the paper's Figures 9 to 11
+
+Scene (grey), the model where it was found (orange), and below it the isolated points.
+
+![Density ratios 20, 5 and 1](pictures/figure_9.png)
+
+![Clutter ratios of the paper's rows](pictures/figure_10.png)
+
+![Branches removed](pictures/figure_11.png)
+"""
+
+
+def origin(results: Results) -> str:
+    """Where the rows come from."""
+    lines = ["## Where the rows come from\n"]
+    for system, rows in results.rows.items():
+        tuned = "; **seeds that were tuned on**" if min(row.seed for row in rows) < PUBLICATION_SEEDS else ""
+        lines.append(f"- {system}: {len(rows)} rows; {'; '.join(results.comments[system])}{tuned}")
+    return "\n".join(lines) + "\n"
+
+
+def held(results: Results) -> str:
+    """The targets."""
+    said = {True: "held", False: "**NOT held**", None: "–"}
+    rows = [[one.what, one.limit, one.measured, said[one.held]] for one in claims(results)]
+    return "## What scanfind is held to\n\n" + table(["", "target", "measured", ""], rows)
+
+
+def by_system(results: Results, experiment: str, key: str) -> str:
+    """Success rate over all scenes and median time, a column a system."""
+    names, systems = results.row_names(experiment, key), results.systems(experiment, key)
+    if not names:
+        return ""
+    theirs = printed(experiment, key)
+    columns = [*([PAPER] if theirs else []), *systems]
+    rows = []
+    for row in names:
+        cells = [row]
+        if theirs:
+            one = theirs.get(row)
+            cells.append("–" if one is None else "fails" if not one.success else f"found, {one.seconds:g} s")
+        for system in systems:
+            mine = results.of(system, experiment, key, row)
+            cells.append(f"{success(mine):.2f}, {_number(middle(mine, lambda r: r.total_s), 2)} s" if mine else "–")
+        rows.append(cells)
+    return f"**{TARGETS[key].capitalize()}**: success rate over all scenes, median time\n\n" + table(
+        [experiment, *columns], rows
+    )
+
+
+def in_detail(results: Results, experiment: str, key: str) -> str:
+    """All about scanfind's rows: medians over all scenes, of errors over those found; the paper's RR and RMS beside."""
+    head = [
+        experiment, "scenes", "points", "on object", "success", "false", "RR", "paper", "precision", "RMS cm", "paper",
+        "to surface mm", "pose mm", "pose °", *(f"{stage} s" for stage in STAGES), "total s",
+    ]  # fmt: skip
+    rows = [
+        [name, *details(mine, printed(experiment, key).get(name))]
+        for name in results.row_names(experiment, key)
+        if (mine := results.of(OURS, experiment, key, name))
+    ]
+    return f"\n{OURS} in detail, medians:\n\n" + table(head, rows) if rows else ""
+
+
+def details(rows: Sequence[Row], theirs: Printed | None) -> list[str]:
+    """The cells of a row of the table above, after its name."""
+    right = [row for row in rows if row.success]
+    return [
+        f"{len(rows)}",
+        f"{middle(rows, lambda r: r.scene_points):.0f}",
+        f"{middle(rows, lambda r: r.object_points):.0f}",
+        f"{success(rows):.2f}",
+        f"{sum(row.false for row in rows)}",
+        _number(middle(rows, lambda r: r.rr), 3),
+        _number(theirs.rr if theirs else math.nan, 3),
+        _number(middle(rows, lambda r: r.precision), 3),
+        _number(middle(rows, lambda r: r.rms_cm), 2),
+        _number(theirs.rms_cm if theirs else math.nan, 2),
+        _number(middle(rows, lambda r: r.rms_surface_mm), 2),
+        _number(middle(right, lambda r: r.error_mm), 2),
+        _number(middle(right, lambda r: r.error_deg), 3),
+        *(_number(middle(rows, attrgetter(f"{stage}_s")), 2) for stage in STAGES),
+        _number(middle(rows, lambda r: r.total_s), 2),
+    ]
+
+
+def effectiveness(results: Results) -> str:
+    """Tables 11 and 12."""
+    rows = [
+        [TARGETS[key], system, f"{len(mine)}", f"{success(mine):.2f}", f"{ratio_of(mine):.2f}"]
+        for key in TARGETS
+        for system in results.systems("effectiveness", key)
+        if (mine := results.of(system, "effectiveness", key))
+    ]
+    for key, value in paper()["tables11_12_effectiveness"].items():
+        rows.append([TARGETS[key], PAPER, "–", "–", f"{value['overlap_ratio_0_15']:.2f}"])
+    return (
+        "## Effectiveness (Tables 11 and 12)\n\nRuns in which the target was isolated and nothing else, over runs in "
+        "which it was isolated at all, with other parameters after a failure.\n\n"
+        + table(["", "system", "runs", "success", "effectiveness ratio"], rows)
+    )
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def _number(value: float, digits: int) -> str:
+    return "–" if math.isnan(value) else f"{value:.{digits}f}"
