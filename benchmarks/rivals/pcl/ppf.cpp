@@ -1,0 +1,56 @@
+// PPFRegistration (Drost et al. 2010); PCL's example ppf_object_recognition.
+#include "rival.h"
+
+#include <pcl/features/ppf.h>
+#include <pcl/registration/ppf_registration.h>
+
+namespace {
+
+constexpr float kAngleStep = 12.0f * static_cast<float>(M_PI) / 180.0f;
+// The example's, in voxels: distance step 0.05 at a leaf of 0.02.
+constexpr float kDistanceStep = 2.5f;
+constexpr unsigned kReferenceRate = 10;
+// The example lumps poses within ten leaves; their mean is then too far from any for ICP.
+constexpr float kPositionCluster = 3.0f, kRotationCluster = 30.0f * static_cast<float>(M_PI) / 180.0f;
+constexpr std::size_t kPoses = 300;
+
+class Ppf {
+ public:
+  Ppf(Cloud::Ptr model, float voxel, float)
+      : model_(std::move(model)), voxel_(voxel),
+        search_(new pcl::PPFHashMapSearch(kAngleStep, kDistanceStep * voxel)) {
+    pcl::PPFEstimation<pcl::PointNormal, pcl::PointNormal, pcl::PPFSignature> estimation;
+    estimation.setInputCloud(model_);
+    estimation.setInputNormals(model_);
+    pcl::PointCloud<pcl::PPFSignature>::Ptr features(new pcl::PointCloud<pcl::PPFSignature>);
+    estimation.compute(*features);
+    search_->setInputFeatureCloud(features);
+  }
+
+  Poses match(const Cloud::Ptr& scene) const {
+    pcl::PPFRegistration<pcl::PointNormal, pcl::PointNormal> align;
+    align.setSceneReferencePointSamplingRate(kReferenceRate);
+    align.setPositionClusteringThreshold(kPositionCluster * voxel_);
+    align.setRotationClusteringThreshold(kRotationCluster);
+    align.setSearchMethod(search_);
+    align.setInputSource(model_);
+    align.setInputTarget(scene);
+    Cloud moved;
+    align.align(moved);
+    Poses poses;
+    for (const auto& one : align.getBestPoseCandidates()) {
+      if (poses.size() == kPoses) break;
+      poses.push_back(one.pose.matrix());
+    }
+    return poses;
+  }
+
+ private:
+  Cloud::Ptr model_;
+  float voxel_;
+  pcl::PPFHashMapSearch::Ptr search_;
+};
+
+}  // namespace
+
+int main(int argc, char** argv) { return converse<Ppf>(argc, argv); }
