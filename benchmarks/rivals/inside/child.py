@@ -5,7 +5,6 @@ Reads problem.npz in FOLDER, trains, says "ready" on stdout, searches, and write
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from pathlib import Path
@@ -13,10 +12,13 @@ from time import perf_counter
 
 import numpy as np
 
+from benchmarks.rivals.answer import Answer, write_answer
 from benchmarks.rivals.inside.finish import finish
 from benchmarks.rivals.inside.matcher import Model, trainer
 from benchmarks.rivals.inside.prepare import prepare_model, prepare_scene
 from scanfind.cloud import OrientedCloud
+
+JUDGED = 3000
 
 
 def main(where: str, tries: int, folder: Path) -> None:
@@ -25,7 +27,7 @@ def main(where: str, tries: int, folder: Path) -> None:
     voxel, seed = float(problem["voxel"]), int(problem["seed"])
     samples = OrientedCloud(problem["model_points"], problem["model_normals"])
     start = perf_counter()
-    matcher = trainer(where)(Model(prepare_model(samples, voxel), samples, voxel, float(problem["diameter"])))
+    matcher = trainer(where)(Model(prepare_model(samples, voxel), voxel, float(problem["diameter"])))
     trained = perf_counter()
 
     print("ready", flush=True)
@@ -35,18 +37,16 @@ def main(where: str, tries: int, folder: Path) -> None:
     prepared = perf_counter()
     proposals = [pose for attempt in range(tries) for pose in matcher(scene.coarse, seed + attempt)]
     matched = perf_counter()
-    best = finish(proposals, samples, scene, voxel)
+    # Every prefix of the samples is itself evenly spread.
+    judged = OrientedCloud(samples.points[:JUDGED], samples.normals[:JUDGED])
+    best = finish(proposals, judged, scene, voxel)
     refined = perf_counter()
 
-    answer = {
-        "poses": [pose.matrix().tolist() for _, pose in best],
-        "scores": [score for score, _ in best],
-        "seconds": {
-            "train": trained - start, "planes": prepared - begin, "match": matched - prepared,
-            "refine": refined - matched, "total": refined - begin,
-        },
+    seconds = {
+        "train": trained - start, "planes": prepared - begin, "match": matched - prepared,
+        "refine": refined - matched, "total": refined - begin,
     }  # fmt: skip
-    (folder / "answer.json").write_text(json.dumps(answer), encoding="utf-8")
+    write_answer(Answer([pose for _, pose in best], [score for score, _ in best], seconds), folder / "answer.json")
 
 
 if __name__ == "__main__":

@@ -19,23 +19,34 @@ CONVERGED = 1e-5  # metres and radians
 # Pairs whose normals are more than 60° apart are of two surfaces; "like" to the check is within 25°.
 PAIR_COSINE, LIKE_COSINE = 0.5, 0.9
 LEAST_PAIRS = 10
-# Of hundreds of proposals, refine those that look best already.
-REFINED, ANSWERED = 40, 5
+# Of hundreds of proposals, those that look best already are refined, on few samples, and the best of these on all.
+REFINED, ROUGH_SAMPLES, ANSWERED = 40, 750, 5
 
 
 def finish(proposals: Sequence[Pose], model: OrientedCloud, scene: Prepared, voxel: float) -> list[tuple[float, Pose]]:
     """Refine what a rival proposes: (score, scene_from_model), best first, no pose twice, at most ANSWERED.
 
-    model : samples of the surface, model frame
+    model : samples of the surface, model frame, of which every prefix is evenly spread
     """
-    by_look = sorted(proposals, key=lambda pose: -check(pose, model, scene, voxel))
-    refined = [icp(pose, model, scene, voxel) for pose in by_look[:REFINED]]
-    ranked = sorted(((check(pose, model, scene, voxel), pose) for pose in refined), key=lambda one: -one[0])
+    few = OrientedCloud(model.points[:ROUGH_SAMPLES], model.normals[:ROUGH_SAMPLES])
+    likely = [pose for _, pose in ranked(proposals, few, scene, voxel)[:REFINED]]
+    rough = distinct(ranked([icp(pose, few, scene, voxel) for pose in likely], few, scene, voxel), few, voxel)
+    refined = [icp(pose, model, scene, voxel) for _, pose in rough[:ANSWERED]]
+    return distinct(ranked(refined, model, scene, voxel), model, voxel)
+
+
+def ranked(poses: Sequence[Pose], model: OrientedCloud, scene: Prepared, voxel: float) -> list[tuple[float, Pose]]:
+    """With what the check says, best first."""
+    return sorted(((check(pose, model, scene, voxel), pose) for pose in poses), key=lambda one: -one[0])
+
+
+def distinct(scored: Sequence[tuple[float, Pose]], model: OrientedCloud, voxel: float) -> list[tuple[float, Pose]]:
+    """Without those within a voxel of a better one."""
     kept: list[tuple[float, Pose]] = []
-    for score, pose in ranked:
+    for score, pose in scored:
         if all(apart(pose, other, model.points) > voxel for _, other in kept):
             kept.append((score, pose))
-    return kept[:ANSWERED]
+    return kept
 
 
 def icp(pose: Pose, model: OrientedCloud, scene: Prepared, voxel: float) -> Pose:

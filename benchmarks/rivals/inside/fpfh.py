@@ -18,6 +18,7 @@ RADIUS_VOXELS, NEIGHBOURS = 5.0, 100
 DISTANCE_VOXELS, EDGE_SIMILARITY = 1.5, 0.9
 ITERATIONS, CONFIDENCE = 1_000_000, 0.999
 DRAWN = 3
+FGR_VOXELS = 1.5
 
 
 def train_ransac(model: Model) -> Matcher:
@@ -50,22 +51,17 @@ def train_fgr(model: Model) -> Matcher:
 
     registration = o3d.pipelines.registration
     source = features(model.cloud, model.voxel)
+    option = registration.FastGlobalRegistrationOption(maximum_correspondence_distance=FGR_VOXELS * model.voxel)
 
     def match(scene: OrientedCloud, seed: int) -> list[Pose]:
         o3d.utility.random.seed(seed)
         target = features(scene, model.voxel)
-        option = registration.FastGlobalRegistrationOption(
-            maximum_correspondence_distance=FGR_VOXELS * model.voxel, seed=seed
-        )
         found = registration.registration_fgr_based_on_feature_matching(
             source[0], target[0], source[1], target[1], option
         )
         return [Pose.from_matrix(found.transformation)]
 
     return match
-
-
-FGR_VOXELS = 1.5
 
 
 def features(cloud: OrientedCloud, voxel: float) -> tuple[Any, Any]:
@@ -79,10 +75,13 @@ def features(cloud: OrientedCloud, voxel: float) -> tuple[Any, Any]:
 
 
 def feature_matches(model: Floats, scene: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of the model's and the scene's features (N, 33) that are each other's nearest."""
+    """Rows of the model's and the scene's features (N, 33), each with its nearest of the other, both ways.
+
+    Mutual ones alone leave a handful of a thousand right.
+    """
     from scipy.spatial import cKDTree
 
     to_scene = cKDTree(scene).query(model, workers=-1)[1]
     to_model = cKDTree(model).query(scene, workers=-1)[1]
-    rows = np.flatnonzero(to_model[to_scene] == np.arange(len(model)))
-    return rows, to_scene[rows]
+    mine = np.concatenate([np.arange(len(model)), to_model])
+    return mine, np.concatenate([to_scene, np.arange(len(scene))])

@@ -15,10 +15,9 @@ Matcher = Callable[[OrientedCloud, int], list[Pose]]
 
 @dataclass(frozen=True)
 class Model:
-    """cloud : at one voxel, as the scene will look; samples : of the surface, four times finer, exact normals."""
+    """What a rival is trained on: the model at one voxel, as the scene will look. Lengths in metres."""
 
     cloud: OrientedCloud
-    samples: OrientedCloud
     voxel: float
     diameter: float
 

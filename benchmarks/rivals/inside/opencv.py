@@ -10,7 +10,7 @@ from scanfind.cloud import OrientedCloud
 from scanfind.pose import Pose
 
 # Its documentation: 0.025 to 0.05 of the diameter. Training grows with the fourth power of its inverse.
-SAMPLING_STEP = 0.04
+SAMPLING_STEP = 0.03
 # Every fifth scene point votes, as in its sample; angles in 30 bins is its default.
 SCENE_SHARE = 1.0 / 5.0
 POSES = 300

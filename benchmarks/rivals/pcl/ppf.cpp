@@ -4,6 +4,9 @@
 #include <pcl/features/ppf.h>
 #include <pcl/registration/ppf_registration.h>
 
+#include <algorithm>
+#include <random>
+
 namespace {
 
 constexpr float kAngleStep = 12.0f * static_cast<float>(M_PI) / 180.0f;
@@ -12,7 +15,6 @@ constexpr float kDistanceStep = 2.5f;
 constexpr unsigned kReferenceRate = 10;
 // The example lumps poses within ten leaves; their mean is then too far from any for ICP.
 constexpr float kPositionCluster = 3.0f, kRotationCluster = 30.0f * static_cast<float>(M_PI) / 180.0f;
-constexpr std::size_t kPoses = 300;
 
 class Ppf {
  public:
@@ -28,6 +30,8 @@ class Ppf {
   }
 
   Poses match(const Cloud::Ptr& scene) const {
+    // It gives one pose, always the same; in another order other points are references, and several tries differ.
+    std::shuffle(scene->begin(), scene->end(), std::mt19937(std::rand()));
     pcl::PPFRegistration<pcl::PointNormal, pcl::PointNormal> align;
     align.setSceneReferencePointSamplingRate(kReferenceRate);
     align.setPositionClusteringThreshold(kPositionCluster * voxel_);
@@ -37,12 +41,7 @@ class Ppf {
     align.setInputTarget(scene);
     Cloud moved;
     align.align(moved);
-    Poses poses;
-    for (const auto& one : align.getBestPoseCandidates()) {
-      if (poses.size() == kPoses) break;
-      poses.push_back(one.pose.matrix());
-    }
-    return poses;
+    return {align.getFinalTransformation()};
   }
 
  private:

@@ -8,7 +8,10 @@
 #include <pcl/point_types.h>
 #include <pcl/point_cloud.h>
 
+#include <unistd.h>
+
 #include <Eigen/Core>
+#include <cstdio>
 #include <cstdlib>
 #include <fstream>
 #include <iostream>
@@ -38,19 +41,23 @@ inline Cloud::Ptr read_cloud(const std::string& path) {
 template <typename Rival>
 int converse(int argc, char** argv) try {
   if (argc != 4) throw std::runtime_error("usage: RIVAL MODEL VOXEL DIAMETER");
+  // PCL prints what it does; only answers go to stdout.
+  std::FILE* answers = fdopen(dup(STDOUT_FILENO), "w");
+  dup2(STDERR_FILENO, STDOUT_FILENO);
   Rival rival(read_cloud(argv[1]), std::stof(argv[2]), std::stof(argv[3]));
-  std::cout << "trained" << std::endl;
+  std::fprintf(answers, "trained\n");
+  std::fflush(answers);
   std::string path;
   unsigned seed = 0;
   while (std::cin >> path >> seed) {
     std::srand(seed);  // all three draw with rand()
     const Poses poses = rival.match(read_cloud(path));
-    std::cout << poses.size() << '\n';
+    std::fprintf(answers, "%zu\n", poses.size());
     for (const auto& pose : poses) {
-      for (int i = 0; i < 12; ++i) std::cout << pose(i / 4, i % 4) << ' ';
-      std::cout << '\n';
+      for (int i = 0; i < 12; ++i) std::fprintf(answers, "%.9g ", pose(i / 4, i % 4));
+      std::fprintf(answers, "\n");
     }
-    std::cout << std::flush;
+    std::fflush(answers);
   }
   return 0;
 } catch (const std::exception& error) {
