@@ -1,9 +1,9 @@
 """Open rivals of scanfind, each in an environment of its own, asked all in the same way.
 
-    from benchmarks.rivals import available, run
+from benchmarks.rivals import available, run
 
-    for name in available():
-        print(name, run(name, points, origins, station, mesh))
+for name in available():
+    print(name, run(name, points, origins, station, mesh))
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.rivals.table import ENVIRONMENTS, RIVALS, Environment
+from benchmarks.rivals.table import ENVIRONMENTS, RIVALS, UNAVAILABLE, Environment
 from scanfind.errors import UsageError
 
 PCL_SOURCE = Path(__file__).parent / "pcl"
@@ -24,10 +24,12 @@ INSTALL_LIMIT_S = 3600.0
 
 def main(names: Sequence[str]) -> int:
     """One line for each environment; 1 where something could not be had."""
-    if unknown := [name for name in names if name not in RIVALS and name not in ENVIRONMENTS]:
-        msg = f"no rival is called {unknown[0]!r}; there are {', '.join(RIVALS)}"
+    if unknown := [name for name in names if name not in RIVALS]:
+        msg = f"no rival is called {unknown[0]!r}: {UNAVAILABLE.get(unknown[0], 'there are ' + ', '.join(RIVALS))}"
         raise UsageError(msg)
-    wanted = {RIVALS[name].environment if name in RIVALS else name for name in names} or set(ENVIRONMENTS)
+    for name in UNAVAILABLE if not names else []:
+        print(f"{name}: not to be had: {UNAVAILABLE[name]}")
+    wanted = {RIVALS[name].environment for name in names} or set(ENVIRONMENTS)
     missing = 0
     for environment in ENVIRONMENTS.values():
         if environment.name not in wanted:
@@ -75,4 +77,7 @@ def _run(*command: str | Path) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except UsageError as error:
+        sys.exit(str(error))

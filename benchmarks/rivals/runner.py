@@ -23,7 +23,7 @@ from scanfind.surface import ModelSurface, SurfaceParameters, sample_mesh
 
 Floats = NDArray[np.float64]
 
-# RIVALS are given the model's surface as scanfind sees it, without the bores nobody sees; 10 samples a voxel.
+# Rivals are given the model's surface as scanfind sees it, without the bores nobody sees; 10 samples a voxel.
 VOXEL_SHARE, SAMPLES = 0.02, 12_000
 # Interpreter, libraries, files and training on the model are not the search; OpenCV trains for half a minute.
 START_LIMIT_S = 180.0
@@ -52,8 +52,17 @@ def run(
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         surface = sample_mesh(mesh, SurfaceParameters(samples=SAMPLES))
-        write_problem(folder / "problem.npz", points, viewpoints(points, origins, station), origins is not None, surface, seed)
-        command = [environment.python, "-m", "benchmarks.rivals.inside.child", rival.train, str(rival.tries), folder]
+        write_problem(
+            folder / "problem.npz", points, viewpoints(points, origins, station), origins is not None, surface, seed
+        )
+        command: list[str | Path] = [
+            environment.python,
+            "-m",
+            "benchmarks.rivals.inside.child",
+            rival.train,
+            str(rival.tries),
+            folder,
+        ]
         variables = {"SCANFIND_RIVALS_PCL": str(environment.folder / "build"), "TMPDIR": scratch}
         return ask(command, folder, time_limit_s, variables)
 
@@ -70,7 +79,9 @@ def viewpoints(points: Floats, origins: Floats | None, station: NDArray[np.int64
     return seen_from[stations]
 
 
-def write_problem(path: Path, points: Floats, seen_from: Floats, signed: bool, surface: ModelSurface, seed: int) -> None:
+def write_problem(
+    path: Path, points: Floats, seen_from: Floats, signed: bool, surface: ModelSurface, seed: int
+) -> None:
     """What the child reads."""
     np.savez(
         path, points=points, viewpoints=seen_from, signed=signed, seed=seed, diameter=surface.diameter,

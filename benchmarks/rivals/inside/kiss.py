@@ -13,7 +13,6 @@ from scanfind.cloud import OrientedCloud
 from scanfind.errors import InvalidGeometryError
 from scanfind.pose import Pose
 
-
 # Its robust defaults cut at 0.75 voxels; features of a thinned frame are that far off themselves.
 NOISE_GAIN = 1.0
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-# Balls that hold the model wherever it lies: at most 0.43 diameters from a centre half a diameter off each way.
+# Balls around the cells with points in them: neighbours share more than half, so that one holds most of a model.
 SPACING, RADIUS = 0.5, 0.75
 LEAST_POINTS = 100
 
