@@ -12,10 +12,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.rivals.table import ENVIRONMENTS, RIVALS, UNAVAILABLE, Environment
+from benchmarks.rivals.table import ENVIRONMENTS, RIVALS, SOURCE, UNAVAILABLE, Environment
 from scanfind.errors import UsageError
 
-PCL_SOURCE = Path(__file__).parent / "pcl"
 PCL_WANTED = "apt-get install --no-install-recommends libpcl-dev cmake g++ pkg-config"
 # Two compilers at a time: PCL's headers take a gigabyte each.
 JOBS = 2
@@ -34,7 +33,7 @@ def main(names: Sequence[str]) -> int:
     for environment in ENVIRONMENTS.values():
         if environment.name not in wanted:
             continue
-        if environment.complete.exists():
+        if environment.is_current():
             print(f"{environment.name}: there already ({environment.folder})")
             continue
         try:
@@ -54,12 +53,12 @@ def install(environment: Environment) -> None:
     _run(environment.python, "-m", "pip", "install", "--quiet", *environment.packages)
     if environment.programs:
         build = environment.folder / "build"
-        _run("cmake", "-S", PCL_SOURCE, "-B", build)
+        _run("cmake", "-S", SOURCE, "-B", build)
         _run("cmake", "--build", build, "--parallel", str(JOBS))
     for module in environment.imports:
         _run(environment.python, "-c", f"import {module}")
     versions = _run(environment.python, "-m", "pip", "freeze")
-    environment.complete.write_text(versions, encoding="utf-8")
+    environment.complete.write_text(f"{environment.recipe()}\n{versions}", encoding="utf-8")
 
 
 def reason(error: Exception) -> str:

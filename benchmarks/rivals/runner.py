@@ -45,8 +45,8 @@ def run(
         raise UsageError(msg)
     rival = RIVALS[name]
     environment = ENVIRONMENTS[rival.environment]
-    if not environment.complete.exists():
-        msg = f"{rival.title} is not installed; run `{rival.install}`"
+    if not environment.is_current():
+        msg = f"{rival.title} is not installed, or not as it is now; run `{rival.install}`"
         raise UsageError(msg)
     points = as_points(points)
     with tempfile.TemporaryDirectory() as scratch:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 HOME = ROOT / ".rivals"
+SOURCE = Path(__file__).parent / "pcl"
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,16 @@ class Environment:
 
     @property
     def complete(self) -> Path:
-        """Written when everything is installed; holds the versions."""
+        """Written when everything is installed; holds `recipe` and the versions."""
         return self.folder / "complete"
+
+    def recipe(self) -> str:
+        """One line of what it was made from: another one, and it is to be made anew."""
+        sources = [path.read_bytes() for path in sorted(SOURCE.iterdir())] if self.programs else []
+        return sha256(b"\n".join([" ".join(self.packages).encode(), *sources])).hexdigest()
+
+    def is_current(self) -> bool:
+        return self.complete.exists() and self.complete.read_text(encoding="utf-8").startswith(self.recipe())
 
 
 @dataclass(frozen=True)
@@ -87,8 +97,8 @@ RIVALS = {
         Rival("kiss_solver", "KISS solver on FPFH", "kiss", f"{_INSIDE}.kiss:train_solver", 1, "MIT"),
         Rival("kiss_matcher", "KISS-Matcher", "kiss", f"{_INSIDE}.kiss:train_pipeline", 1, "MIT"),
         Rival("opencv_ppf", "OpenCV PPF", "opencv", f"{_INSIDE}.opencv:train", 1, "Apache-2.0"),
-        Rival("pcl_objrecransac", "PCL ObjRecRANSAC", "pcl", f"{_INSIDE}.pcl:train_objrecransac", 1, "BSD-3-Clause"),
-        Rival("pcl_prerejective", "PCL prerejective", "pcl", f"{_INSIDE}.pcl:train_prerejective", 4, "BSD-3-Clause"),
+        Rival("pcl_objrecransac", "PCL ObjRecRANSAC", "pcl", f"{_INSIDE}.pcl:train_objrecransac", 5, "BSD-3-Clause"),
+        Rival("pcl_prerejective", "PCL prerejective", "pcl", f"{_INSIDE}.pcl:train_prerejective", 3, "BSD-3-Clause"),
         Rival("pcl_ppf", "PCL PPF", "pcl", f"{_INSIDE}.pcl:train_ppf", 3, "BSD-3-Clause"),
     )
 }
@@ -96,4 +106,4 @@ RIVALS = {
 
 def available() -> list[str]:
     """Names of the rivals whose environment is there."""
-    return [name for name, rival in RIVALS.items() if ENVIRONMENTS[rival.environment].complete.exists()]
+    return [name for name, rival in RIVALS.items() if ENVIRONMENTS[rival.environment].is_current()]

@@ -82,11 +82,11 @@ def main(names: Sequence[str]) -> None:
             found = bool(errors) and errors[0] < 1e3 * FOUND_M
             spent = " ".join(f"{stage} {seconds:.1f}" for stage, seconds in answer.seconds.items())
             told = " ".join(f"{error:.1f}/{score:.3f}" for error, score in zip(errors, answer.scores, strict=True))
+            scene = f"{trial.kind} {trial.target}{trial.seed} clutter {trial.clutter:4.0f}"
             print(
-                f"{trial.kind} {trial.target}{trial.seed} clutter {trial.clutter:4.0f} {RIVALS[name].title:24} {'found' if found else '-':6}"
-                f"{spent} | mm/score {told} {answer.error}",
+                f"{scene} {RIVALS[name].title:24} {'found' if found else '-':6} {spent} | mm/score {told} {answer.error}",
                 flush=True,
-            )  # fmt: skip
+            )
 
 
 if __name__ == "__main__":

@@ -66,7 +66,7 @@ def icp(pose: Pose, model: OrientedCloud, scene: Prepared, voxel: float) -> Pose
 
 
 def tukey_step(points: Floats, normals: Floats, targets: Floats, gate: float) -> tuple[Floats, Floats]:
-    """One Gauss-Newton step (6,), rotation vector and translation, of points (K, 3) to targets, and what it turns about.
+    """One Gauss-Newton step of points (K, 3) to targets: rotation vector and translation (6,), and what it turns about.
 
     Weights are Tukey's biweight of the distance along the normal: nothing beyond the gate pulls.
     """

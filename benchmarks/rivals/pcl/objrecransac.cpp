@@ -8,7 +8,8 @@
 
 namespace {
 
-constexpr float kPairWidth = 0.25f;  // of the diameter
+constexpr float kPairWidth = 0.4f;  // of the diameter; its documentation: half of what is seen
+constexpr float kLeaf = 1.5f;       // in voxels: at one, a scene thinned on another grid leaves holes in its octree
 constexpr float kCoplanarityDegrees = 15.0f;
 constexpr double kSuccess = 0.999;
 
@@ -45,7 +46,7 @@ std::vector<Eigen::Matrix3f> views() {
 
 class ObjRecRansac {
  public:
-  ObjRecRansac(const Cloud::Ptr& model, float voxel, float diameter) : recogniser_(kPairWidth * diameter, voxel) {
+  ObjRecRansac(const Cloud::Ptr& model, float voxel, float diameter) : recogniser_(kPairWidth * diameter, kLeaf * voxel) {
     pcl::PointCloud<pcl::PointXYZ> points;
     pcl::PointCloud<pcl::Normal> normals;
     split(*model, Eigen::Matrix3f::Identity(), points, normals);
