@@ -99,7 +99,7 @@ RIVALS = {
         Rival("opencv_ppf", "OpenCV PPF", "opencv", f"{_INSIDE}.opencv:train", 1, "Apache-2.0"),
         Rival("pcl_objrecransac", "PCL ObjRecRANSAC", "pcl", f"{_INSIDE}.pcl:train_objrecransac", 5, "BSD-3-Clause"),
         Rival("pcl_prerejective", "PCL prerejective", "pcl", f"{_INSIDE}.pcl:train_prerejective", 3, "BSD-3-Clause"),
-        Rival("pcl_ppf", "PCL PPF", "pcl", f"{_INSIDE}.pcl:train_ppf", 3, "BSD-3-Clause"),
+        Rival("pcl_ppf", "PCL PPF", "pcl", f"{_INSIDE}.pcl:train_ppf", 10, "BSD-3-Clause"),
     )
 }
 

@@ -83,8 +83,9 @@ def main(names: Sequence[str]) -> None:
             spent = " ".join(f"{stage} {seconds:.1f}" for stage, seconds in answer.seconds.items())
             told = " ".join(f"{error:.1f}/{score:.3f}" for error, score in zip(errors, answer.scores, strict=True))
             scene = f"{trial.kind} {trial.target}{trial.seed} clutter {trial.clutter:4.0f}"
+            verdict = "found" if found else "-"
             print(
-                f"{scene} {RIVALS[name].title:24} {'found' if found else '-':6} {spent} | mm/score {told} {answer.error}",
+                f"{scene} {RIVALS[name].title:24} {verdict:6} {spent} | mm/score {told} {answer.error}",
                 flush=True,
             )
 
