@@ -9,9 +9,9 @@ from benchmarks.rivals.inside.matcher import Matcher, Model
 from scanfind.cloud import OrientedCloud
 from scanfind.pose import Pose
 
-# Its documentation: 0.025 to 0.05 of the diameter. Training grows with the fourth power of its inverse.
+# Its example has 0.05 of the diameter, `match` by default 0.03. Training grows with the fourth power of its inverse.
 SAMPLING_STEP = 0.03
-# Every fifth scene point votes, as in its sample; angles in 30 bins is its default.
+# Every fifth scene point votes: its default, as are angles in 30 bins.
 SCENE_SHARE = 1.0 / 5.0
 POSES = 300
 
