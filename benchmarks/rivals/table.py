@@ -84,7 +84,7 @@ ENVIRONMENTS = {
 # What was tried and is not to be had by a package manager; the installer says so.
 UNAVAILABLE = {
     "teaser": "TEASER++: no wheel on PyPI, and the build of its source package (cmeel-teaser-plusplus 2.0) fetches "
-    "pybind11, PMC and Spectra from elsewhere and fails where it cannot; left out, not run untested",
+    "pybind11 and PMC from elsewhere and fails where it cannot; left out, not run untested",
 }
 
 _INSIDE = "benchmarks.rivals.inside"
