@@ -359,15 +359,31 @@ def resampled(points: Floats, cell: float, parameters: GridParameters) -> Scene:
     return build_scene(grid_of([chunk(points)], cell), 2.0, parameters, 40.0, 2)
 
 
-def test_cells_grow_until_the_scan_fills_them_and_no_further() -> None:
+def test_cells_grow_until_most_points_have_a_normal_and_no_further() -> None:
+    points = bumpy(4000)
+    for share in (0.3, 0.9, 1.0):
+        parameters = GridParameters(points_per_cell=0.0, normal_share=share, least_cells_across=10.0)
+        scene = resampled(points, 0.01, parameters)
+        assert scene.fine.cell <= 0.2
+        assert scene.coarse.cell == 2 * scene.fine.cell
+        assert scene.fine.cell >= 0.1 or share_with_normal(points, scene.fine.cell) >= share
+        assert scene.fine.cell == 0.01 or share_with_normal(points, 0.5 * scene.fine.cell) < share
+    assert resampled(points, 0.01, GridParameters(cell_m=0.01, normal_share=1.0)).fine.cell == 0.01
+
+
+def test_cells_grow_until_the_scan_fills_them() -> None:
     points = bumpy(4000)
     for sparse in (2.0, 8.0, 1e9):
         scene = resampled(points, 0.01, GridParameters(points_per_cell=sparse, least_cells_across=10.0))
         full = scene.fine.cell >= 0.1 or grid_of([chunk(points)], scene.fine.cell).points_per_row() >= sparse
         assert full
-        assert scene.fine.cell <= 0.2
-        assert scene.coarse.cell == 2 * scene.fine.cell
     assert resampled(points, 0.01, GridParameters(cell_m=0.01, points_per_cell=1e9)).fine.cell == 0.01
+
+
+def share_with_normal(points: Floats, cell: float) -> float:
+    """Of the points, in cells of that size; the middle of the grid is where the scene has it."""
+    found = fitted(grid_of([chunk(points)], cell))
+    return float(found.points[found.has_normal()].sum() / len(points))
 
 
 @pytest.mark.parametrize("points", [np.zeros((1, 3)), np.zeros((500, 3)), np.array([[0.0, 0, 0], [1.0, 1, 1]])])

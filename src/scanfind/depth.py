@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 DEPTH_PIXELS = 360  # along an edge of the cube map: 0.25° a pixel, 35 mm at 8 m
-# Where a scan has fewer beams than pixels, pixels are joined until most of what was looked at has a range.
-MOST_HOLES, LEAST_DEPTH_PIXELS = 0.15, 45
+# Pixels are joined until the maps speak of this share of what they look at: of the samples they are silent about, those
+# they speak of tell (verify.spread). Joined further, a part missing from the scan is taken for one seen through.
+LEAST_SPOKEN, LEAST_DEPTH_PIXELS = 0.08, 45
+ENOUGH_AROUND = 3  # of a pixel and the four beside it must be filled for a sample to be seen through or hidden
+LOOKED_AT = 45  # patches along an edge, of 2°: one with any range in it was looked at
 
 
 class DepthMap(NamedTuple):
@@ -31,15 +34,26 @@ class DepthMap(NamedTuple):
         pixels = self.ranges.reshape(6, half, 2, half, 2)
         return DepthMap(self.origin, pixels.min(axis=(2, 4)).reshape(-1), half)
 
-    def holes(self) -> float:
-        """Share of empty pixels among the four of each coarser pixel that saw anything: 3/4 where beams are sparse."""
-        filled = float(np.isfinite(self.ranges).sum())
-        around = 4.0 * float(np.isfinite(self.coarser().ranges).sum())
-        return 1.0 - filled / around if around else 0.0
+    def spoken(self) -> float:
+        """The share of what was looked at where a sample gets an answer: its pixel and those beside it mostly full."""
+        filled = np.isfinite(self.ranges).reshape(6, self.edge, self.edge)
+        around = filled.astype(np.int8)
+        for axis in (1, 2):
+            around[(slice(None),) * axis + (slice(1, None),)] += filled[(slice(None),) * axis + (slice(None, -1),)]
+            around[(slice(None),) * axis + (slice(None, -1),)] += filled[(slice(None),) * axis + (slice(1, None),)]
+        few = self.edge // LOOKED_AT
+        looked = filled.reshape(6, LOOKED_AT, few, LOOKED_AT, few).any(axis=(2, 4))
+        looked = looked.repeat(few, axis=1).repeat(few, axis=2)
+        return float((around >= ENOUGH_AROUND)[looked].mean()) if looked.any() else 1.0
 
 
-def joined_until_full(maps: list[DepthMap]) -> list[DepthMap]:
-    """Depth maps of one resolution, made coarser together until the worst of them has few holes."""
-    while maps and maps[0].edge > LEAST_DEPTH_PIXELS and max(depth.holes() for depth in maps) > MOST_HOLES:
+def joined_until_spoken(maps: list[DepthMap]) -> list[DepthMap]:
+    """Depth maps of one resolution, made coarser together until they speak of enough of what they look at."""
+    while maps and maps[0].edge > LEAST_DEPTH_PIXELS and spoken(maps) < LEAST_SPOKEN:
         maps = [depth.coarser() for depth in maps]
     return maps
+
+
+def spoken(maps: list[DepthMap]) -> float:
+    """The share of samples in sight of a scanner that some depth maps speak of."""
+    return float(np.mean([depth.spoken() for depth in maps])) if maps else 1.0

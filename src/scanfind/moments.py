@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.cloud import PointChunk
-from scanfind.depth import DEPTH_PIXELS, DepthMap, joined_until_full
+from scanfind.depth import DEPTH_PIXELS, DepthMap, joined_until_spoken
 from scanfind.threads import side_by_side
 
 Floats = NDArray[np.float64]
@@ -162,7 +162,7 @@ class MomentGrid:
     def depth_maps(self) -> list[DepthMap]:
         """One for each scanner position, in the order of their coordinates."""
         self.release()
-        return joined_until_full(
+        return joined_until_spoken(
             [DepthMap(np.array(key), self._depths[key], DEPTH_PIXELS) for key in sorted(self._depths)]
         )
 

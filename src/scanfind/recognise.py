@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import log
+from math import ceil, log
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -14,7 +14,17 @@ from scanfind.pose import Pose
 from scanfind.refine import Refined, icp, shrinking, unobservable
 from scanfind.search import AREA_OF_A_SAMPLE, Hypotheses, Search, model_arrays
 from scanfind.symmetry import self_similar
-from scanfind.verify import Evidence, distances, distinct, gather, outlines, rough_score, score, why_refused
+from scanfind.verify import (
+    Evidence,
+    Level,
+    distances,
+    distinct,
+    gather,
+    outlines,
+    rough_score,
+    score,
+    why_refused,
+)
 
 if TYPE_CHECKING:
     from scanfind.library import JointTable
@@ -66,7 +76,12 @@ class Recognition:
         self.scene, self.models, self.parameters, self.jobs = scene, models, parameters, jobs
         self.arrays = model_arrays(models)
         self.search = Search(scene, models, table, self.arrays, parameters.search, seed, jobs)
-        self.telling = self.search.telling()
+        fine, coarse = self.search.telling()
+        inlier = parameters.verify.inlier_noises * scene.noise
+        inliers = [inlier + parameters.verify.inlier_cells * level.cell for level in (scene.fine, scene.coarse)]
+        self._fine = Level(scene.fine, fine, ALL_SAMPLES, inliers[0])
+        self._thin = Level(scene.coarse, coarse, ALL_SAMPLES, inliers[0])
+        self._rough = Level(scene.coarse, coarse, parameters.refine.coarse_samples, inliers[1])
         self.signed = scene.fine.signed and all(model.signed for model in models)
         self.blind = not scene.depths
         self.believed: list[Candidate] = []
@@ -116,8 +131,7 @@ class Recognition:
 
     def _promising(self, hypotheses: Hypotheses, shown: int) -> NDArray[np.intp]:
         """Those whose evidence on the coarse surfels is not hopeless, and the best `shown` of each model (indices)."""
-        verify, few = self.parameters.verify, self.parameters.refine.coarse_samples
-        evidence = self._evidence(hypotheses, self.scene.coarse, few)
+        verify, evidence = self.parameters.verify, self._evidence(hypotheses, self._rough)
         scores = np.array([rough_score(seen, self.blind, verify) for seen in evidence])
         kept = scores >= PROMISING * verify.min_score
         for model in np.unique(hypotheses.models):
@@ -160,17 +174,15 @@ class Recognition:
     def _no_rows(self) -> NDArray[np.bool_]:
         return np.zeros(len(self.scene.fine.sides), np.bool_)
 
-    def _evidence(self, hypotheses: Hypotheses, surfels: Surfels, most_samples: int) -> list[Evidence]:
-        return gather(
-            hypotheses, self.scene, surfels, most_samples, self.telling if surfels is self.scene.fine else None,
-            self.arrays, self.signed, self.parameters.verify, self.jobs,
-        )  # fmt: skip
+    def _evidence(self, hypotheses: Hypotheses, level: Level, thin: Level | None = None) -> list[Evidence]:
+        verify = self.parameters.verify
+        return gather(hypotheses, self.scene, level, thin, self.arrays, self.signed, verify, self.jobs)
 
     def candidates(self, refined: Refined) -> list[Candidate]:
         """Refined poses with their evidence."""
         verify = self.parameters.verify
-        self._fit_near(refined.hypotheses, 1)
-        evidence = self._evidence(refined.hypotheses, self.scene.fine, ALL_SAMPLES)
+        self._fit_near(refined.hypotheses, ceil(verify.gate_cells))
+        evidence = self._evidence(refined.hypotheses, self._fine, self._thin)
         found = []
         for k, seen in enumerate(evidence):
             number = int(refined.hypotheses.models[k])

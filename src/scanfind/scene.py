@@ -17,7 +17,7 @@ from scanfind.surfels import Surfels, empty_hash
 Floats = NDArray[np.float64]
 
 SMALLEST_CELL_M = 1e-3
-NOISE_SURFELS = 20_000  # tell the noise: of a median within a hundredth
+SAMPLE = 20_000  # cells tell the noise, as a median, within a hundredth
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ class GridParameters:
     cells_across : how many cells the diameter of the smallest model spans; 180 makes 20 mm of a 3.6 m spool
     least_cells_across : never fewer, however sparse the scan
     points_per_cell : a cell must hold so many points on average, or cells are doubled; fewer make poor normals
+    normal_share : share of the points that must lie in cells with a normal, or cells are doubled
     min_neighbours : occupied cells of the 3×3×3 (itself included) below which a cell has no normal, only presence
     """
 
@@ -36,6 +37,7 @@ class GridParameters:
     cells_across: float = 180.0
     least_cells_across: float = 30.0
     points_per_cell: float = 1.25
+    normal_share: float = 0.65
     min_neighbours: int = 5
 
     def __post_init__(self) -> None:
@@ -45,6 +47,7 @@ class GridParameters:
             self.cells_across >= self.least_cells_across, "cells_across", self.cells_across, "no less than the least"
         )
         require(self.points_per_cell >= 0.0, "points_per_cell", self.points_per_cell, "0 or more")
+        require(0.0 <= self.normal_share <= 1.0, "normal_share", self.normal_share, "from 0 to 1")
         require(1 <= self.min_neighbours <= 27, "min_neighbours", self.min_neighbours, "from 1 to 27")
 
 
@@ -113,39 +116,52 @@ def build_scene(
         one off along its normal
     """
     largest_cell = diameter / parameters.least_cells_across
-    if parameters.cell_m is None:
-        while grid.points_per_row() < parameters.points_per_cell and 2.0 * grid.cell <= largest_cell:
-            grid = grid.coarser()
+    fine = Surfels(grid, parameters.min_neighbours, jobs)
+    while parameters.cell_m is None and 2.0 * grid.cell <= largest_cell and not filled(grid, fine, parameters):
+        grid = grid.coarser()
+        fine = Surfels(grid, parameters.min_neighbours, jobs)
     half = grid.coarser()
     quarter = half.coarser()
-    fine = Surfels(grid, parameters.min_neighbours, jobs)
     coarse = Surfels(half, parameters.min_neighbours, jobs).fit()
     around = Surfels(quarter, 1, jobs).fit()
-    test_cell = max(diameter / test_cells_across, coarse.cell)
+    test_cell = max(diameter / test_cells_across, around.cell)
     tolerant = orientation_grid(coarse, 0.5 * test_cell, test_cell)
     return Scene(
-        fine, coarse, around, tolerant, grid.depth_maps(), noise_of(fine), grid.points, grid.unaddressable
+        fine, coarse, around, tolerant, grid.depth_maps(), noise_of(fine, some(fine)), grid.points, grid.unaddressable
     )  # fmt: skip
 
 
-def noise_of(surfels: Surfels) -> float:
-    """The noise in a scan, metres: the flatness of its median surfel, of some.
+def some(surfels: Surfels) -> NDArray[np.intp]:
+    """Surfels of cells spread over the scene, SAMPLE of them."""
+    cells = len(surfels.cells)
+    return surfels.of(np.arange(0, cells, max(1, cells // SAMPLE)))
+
+
+def filled(grid: MomentGrid, surfels: Surfels, parameters: GridParameters) -> bool:
+    """Does a scan fill the cells of a level, so that most of its points get a normal?"""
+    if grid.points_per_row() < parameters.points_per_cell:
+        return False
+    of = some(surfels)
+    points = surfels.points[of]
+    return bool(points @ surfels.has_normal()[of] >= parameters.normal_share * points.sum())
+
+
+def noise_of(surfels: Surfels, of: NDArray[np.intp]) -> float:
+    """The noise in a scan, metres: the flatness of the median of some surfels.
 
     The median: edges and bends spread the upper half, and quantised ranges (a Kinect's) lie in one plane in much of the
     lower.
     """
-    some = np.arange(0, len(surfels.cells), max(1, len(surfels.cells) // NOISE_SURFELS))
-    fitted = surfels.of(some)
-    return float(np.median(surfels.flatness[fitted])) if len(fitted) else 0.0
+    return float(np.median(surfels.flatness[of])) if len(of) else 0.0
 
 
-def flatness_above(fine: Surfels, around: Surfels) -> NDArray[np.float32]:
-    """For each fine cell the flatness about the cell two levels above it, (V,), metres."""
+def flatness_above(surfels: Surfels, levels: int, around: Surfels) -> NDArray[np.float32]:
+    """For each cell the flatness about the cell some levels above it, (V,), metres."""
     from scanfind.kernels.shape import spread_down
 
-    found, cells, above = np.empty(len(fine.cells), np.float32), fine.cells, around.cells
+    found, cells, above = np.empty(len(surfels.cells), np.float32), surfels.cells, around.cells
     spread_down(
-        2, cells.block_keys, cells.order, cells.first_cell, cells.locals, above.hash_keys, above.hash_values,
+        levels, cells.block_keys, cells.order, cells.first_cell, cells.locals, above.hash_keys, above.hash_values,
         above.block_rows, around.flatness[around.first_surfel], found,
     )  # fmt: skip
     return found

@@ -183,7 +183,7 @@ class Search:
         self.pairs = models[0].parameters.pairs
         self.rungs = sorted({rung for m in models for rung in rungs_of(m.diameter, m.parameters.pairs)}, reverse=True)
         window = 3.0 * scene.around.cell
-        self._classes = shape_classes(flatness_above(scene.fine, scene.around), window)
+        self._classes = shape_classes(flatness_above(scene.fine, 2, scene.around), window)
         self._free = np.ones(len(scene.fine.cells), np.bool_)
         known = parameters.facing_only and scene.fine.signed and len(scene.depths) <= FACING_ORIGINS
         self._origins = scene.origins() if known else np.empty((0, 3))
@@ -239,14 +239,16 @@ class Search:
             clean[alike] |= flatness[alike] <= np.quantile(flatness[alike], CLEAN_SHARE)
         return clean
 
-    def telling(self) -> Floats:
-        """How much the surfels of each cell tell, (V,), 0 … 1: the root of the likelihood ratio of its shape, model
-        against scene.
+    def telling(self) -> tuple[Floats, Floats]:
+        """How much the surfels of each fine and of each coarse cell tell, (V,), 0 … 1: the root of the likelihood ratio
+        of their shape, model against scene.
 
         A plate flush with a floor lies on the scene with all of its samples, and that means nothing.
         """
         _, likelihood = self._likelihood(np.ones(len(self._classes), np.bool_))
-        return np.asarray(np.sqrt(likelihood)[self._classes])
+        scene, tells = self.scene, np.sqrt(likelihood)
+        coarse = shape_classes(flatness_above(scene.coarse, 1, scene.around), 3.0 * scene.around.cell)
+        return tells[self._classes], tells[coarse]
 
     def _likelihood(self, among: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Floats]:
         """Of C classes of shape, how many of some cells are in each, and its likelihood ratio over the largest, (C,).

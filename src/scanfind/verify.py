@@ -58,7 +58,7 @@ class VerifyParameters:
     def __post_init__(self) -> None:
         for name in ("min_score", "min_support", "min_support_blind", "normal_agreement", "least_facing", "shared"):
             require(0.0 <= getattr(self, name) <= 1.0, name, getattr(self, name), "from 0 to 1")
-        require(0.0 < self.gate_cells <= 1.0, "gate_cells", self.gate_cells, "above 0 and at most 1")
+        require(0.0 < self.gate_cells <= 4.0, "gate_cells", self.gate_cells, "above 0 and at most 4")
         for name in ("inlier_noises", "inlier_cells", "margin_inliers", "margin_cells", "penalty_weight"):
             require(getattr(self, name) >= 0.0, name, getattr(self, name), "0 or more")
         require(self.alternatives >= 0, "alternatives", self.alternatives, "0 or more")
@@ -66,13 +66,16 @@ class VerifyParameters:
 
 # Share of a model's surface that scans from a few sides show: full marks where nothing tells hidden from missing.
 EXPECTED_BLIND = 0.5
-BELIEVED_SUPPORT = 0.065
+BELIEVED_SUPPORT = 0.068
+# Points in a coarse cell up to which the eight fine ones in it are mostly empty.
+THIN_POINTS = 2.0
 
 
 class Evidence(NamedTuple):
     """What the scene says of the samples of one pose.
 
-    samples : N; supported, seen_through, hidden : how many of them
+    samples : N; supported, seen_through, hidden : how many of them; where few beams lead to the others, seen_through is
+        what it would be with beams enough (see spread)
     telling : share of all samples that are supported, each counted by how much its surfel tells (Search.telling)
     rms : of the supported samples' distances to the scene, metres
     claims : surfels that support it, ascending
@@ -134,49 +137,87 @@ def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters) -
     return f"what lies on the scan is too little, or of a shape the scan is full of (floors, walls), to tell: {reached}"
 
 
+class Level(NamedTuple):
+    """A level of the scene that samples are held against.
+
+    surfels : fitted around the poses; telling : (V,) how much those of each cell tell (Search.telling)
+    samples : at most so many of each model; inlier : metres, see VerifyParameters
+    """
+
+    surfels: Surfels
+    telling: Floats
+    samples: int
+    inlier: float
+
+
 def gather(
-    hypotheses: Hypotheses, scene: Scene, surfels: Surfels, most_samples: int, telling: Floats | None,
-    arrays: ModelArrays, signed: bool, parameters: VerifyParameters, jobs: int,
+    hypotheses: Hypotheses, scene: Scene, level: Level, thin: Level | None, arrays: ModelArrays, signed: bool,
+    parameters: VerifyParameters, jobs: int,
 ) -> list[Evidence]:  # fmt: skip
     """The evidence of each of H hypotheses.
 
-    surfels : of the level of the scene it is gathered on; most_samples : of each model
-    telling : (V,) how much the surfels of each cell tell (Search.telling); None: nothing
+    thin : a coarser level, which speaks where its cells hold so few points that the cells of `level` are mostly empty
     """
-    from scanfind.kernels.evidence import HIDDEN, SEEN_THROUGH, SUPPORTED, gather_evidence
+    from scanfind.kernels.evidence import HIDDEN, SEEN_THROUGH, SILENT, SUPPORTED
 
-    sizes = np.minimum(arrays.starts[1:] - arrays.starts[:-1], most_samples)[hypotheses.models]
+    sizes = np.minimum(arrays.starts[1:] - arrays.starts[:-1], level.samples)[hypotheses.models]
     ends = np.cumsum(sizes)
-    total = int(ends[-1]) if len(ends) else 0
+    states, residuals, claims = held_against(hypotheses, scene, level, sizes, arrays, signed, parameters, jobs)
+    tells = np.where(claims >= 0, level.telling[level.surfels.cell_of[claims]], 0.0)
+    if thin is not None:
+        others, apart, lent = held_against(hypotheses, scene, thin, sizes, arrays, signed, parameters, jobs)
+        lends = (states != SUPPORTED) & (others == SUPPORTED)
+        lends[lends] = thin.surfels.points[lent[lends]] <= THIN_POINTS
+        states[lends], residuals[lends] = SUPPORTED, apart[lends]
+        tells[lends] = thin.telling[thin.surfels.cell_of[lent[lends]]]
+    found = []
+    for start, stop in zip(ends - sizes, ends, strict=True):
+        state, claim = states[start:stop], claims[start:stop]
+        on = state == SUPPORTED
+        through, hidden, silent = (int(np.count_nonzero(state == of)) for of in (SEEN_THROUGH, HIDDEN, SILENT))
+        squares = residuals[start:stop][on].astype(np.float64) ** 2
+        found.append(
+            Evidence(
+                int(stop - start), int(np.count_nonzero(on)), spread(through, hidden, silent), hidden,
+                float(tells[start:stop].sum()) / int(stop - start),
+                float(np.sqrt(squares.mean())) if len(squares) else float("inf"),
+                np.unique(claim[claim >= 0]).astype(np.intp),
+            )
+        )  # fmt: skip
+    return found
+
+
+def held_against(
+    hypotheses: Hypotheses, scene: Scene, level: Level, sizes: NDArray[np.int64], arrays: ModelArrays, signed: bool,
+    parameters: VerifyParameters, jobs: int,
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int32]]:  # fmt: skip
+    """What a level says of each sample of each pose, `sizes` (H,) of them end to end: see kernels.evidence."""
+    from scanfind.kernels.evidence import gather_evidence
+
+    ends, total = np.cumsum(sizes), int(sizes.sum())
     states, residuals, claims = np.empty(total, np.uint8), np.empty(total, np.float32), np.empty(total, np.int32)
-    cells, cell = surfels.cells, surfels.cell
+    surfels, cells, cell = level.surfels, level.surfels.cells, level.surfels.cell
     origins, ranges = scene.origins(), scene.ranges()
-    inlier = parameters.inlier_noises * scene.noise + parameters.inlier_cells * cell
-    margin = parameters.margin_inliers * inlier + parameters.margin_cells * cell
+    margin = parameters.margin_inliers * level.inlier + parameters.margin_cells * cell
     edge = scene.depths[0].edge if scene.depths else 1
     in_threads(
         jobs, len(sizes),
         lambda start, stop: gather_evidence(
-            start, stop, hypotheses.models, arrays.starts, arrays.points, arrays.normals, most_samples,
-            hypotheses.rotations, hypotheses.translations, parameters.gate_cells * cell, inlier,
+            start, stop, hypotheses.models, arrays.starts, arrays.points, arrays.normals, level.samples,
+            hypotheses.rotations, hypotheses.translations, parameters.gate_cells * cell, level.inlier,
             parameters.normal_agreement, signed, cell, cells.hash_keys, cells.hash_values, cells.block_rows,
             surfels.first_surfel, surfels.sides, surfels.means, surfels.normals, origins, ranges, edge, margin,
             parameters.least_facing, ends - sizes, states, residuals, claims,
         ),
     )  # fmt: skip
-    found = []
-    for start, stop in zip(ends - sizes, ends, strict=True):
-        state, claim = states[start:stop], claims[start:stop]
-        on = state == SUPPORTED
-        squares = residuals[start:stop][on].astype(np.float64) ** 2
-        found.append(
-            Evidence(
-                int(stop - start), int(on.sum()), int((state == SEEN_THROUGH).sum()), int((state == HIDDEN).sum()),
-                0.0 if telling is None else float(telling[surfels.cell_of[claim[on]]].sum()) / int(stop - start),
-                float(np.sqrt(squares.mean())) if len(squares) else float("inf"), np.unique(claim[on]).astype(np.intp),
-            )
-        )  # fmt: skip
-    return found
+    return states, residuals, claims
+
+
+def spread(through: int, hidden: int, silent: int) -> int:
+    """How many samples beams would have passed through, had there been beams enough to ask of all: the silent ones are
+    like those that spoke.
+    """
+    return through + round(silent * through / (through + hidden)) if through else 0
 
 
 def distinct(

@@ -11,7 +11,7 @@ from scanfind.kernels.grid import cube_pixel
 from scanfind.kernels.nearest import nearest_surfel
 from scanfind.kernels.placed import placed
 
-NO_EVIDENCE, SUPPORTED, SEEN_THROUGH, HIDDEN = 0, 1, 2, 3
+NO_EVIDENCE, SUPPORTED, SEEN_THROUGH, HIDDEN, SILENT = 0, 1, 2, 3, 4
 
 
 @njit(cache=True, nogil=True)
@@ -29,8 +29,9 @@ def gather_evidence(
     margin : metres; a beam must have gone on so far behind a sample to have passed through it
     least_facing : cosine to the beam below which a surface may return nothing, so that its absence says nothing
     first_sample : (H,) where each pose's samples begin in the outputs
-    states : out, uint8, one of the four above; residuals : out, float32, metres along the surfel's normal, + where
-        the scene is outside the model; claims : out, int32, the supporting surfel, -1 for none
+    states : out, uint8, one of the five above, SILENT where too few beams lead to the sample to tell
+    residuals : out, float32, metres along the surfel's normal, + where the scene is outside the model
+    claims : out, int32, the supporting surfel, -1 for none
     """
     pixel_angle = 2.0 / edge
     for h in range(start, stop):
@@ -74,9 +75,11 @@ def gather_evidence(
                         seen += 1
                         nearest = min(nearest, depth)
                 if seen < 3:
+                    if states[at] == NO_EVIDENCE:
+                        states[at] = SILENT
                     continue
                 if nearest > away + margin:
                     states[at] = SEEN_THROUGH
                     break
-                if states[at] == NO_EVIDENCE:
+                if states[at] != SUPPORTED:
                     states[at] = HIDDEN

@@ -1,4 +1,4 @@
-"""The surfel a placed model point lies on: nearest in the 3×3×3 cells around it, with a like normal."""
+"""The surfel a placed model point lies on: the nearest in the cells around it, with a like normal."""
 
 from __future__ import annotations
 
@@ -20,14 +20,11 @@ def nearest_surfel(
     least_cosine : of the angle between normals; by magnitude where the scene's normals are not signed
     """
     inverse = 1.0 / cell
-    gx, gy, gz = x * inverse, y * inverse, z * inverse
-    cx, cy, cz = np.int64(floor(gx)), np.int64(floor(gy)), np.int64(floor(gz))
+    reach = gate * inverse
+    x0, x1 = np.int64(floor(x * inverse - reach)), np.int64(floor(x * inverse + reach))
+    y0, y1 = np.int64(floor(y * inverse - reach)), np.int64(floor(y * inverse + reach))
+    z0, z1 = np.int64(floor(z * inverse - reach)), np.int64(floor(z * inverse + reach))
     best, nearest = np.int64(-1), gate * gate
-    # The eight nearest of the 27 cells hold everything within half a cell; the others only matter for wider gates.
-    wide = gate > 0.5 * cell
-    x0, x1 = (cx - 1, cx + 1) if wide else (cx - (1 if gx - cx < 0.5 else 0), cx + (0 if gx - cx < 0.5 else 1))
-    y0, y1 = (cy - 1, cy + 1) if wide else (cy - (1 if gy - cy < 0.5 else 0), cy + (0 if gy - cy < 0.5 else 1))
-    z0, z1 = (cz - 1, cz + 1) if wide else (cz - (1 if gz - cz < 0.5 else 0), cz + (0 if gz - cz < 0.5 else 1))
     key, block = np.int64(-1), np.int64(-1)
     for ix in range(x0, x1 + 1):
         for iy in range(y0, y1 + 1):
