@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from math import comb
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from scanfind.cloud import PointChunk
+from scanfind.depth import LEAST_SPOKEN, DepthMap, joined_until_spoken
 from scanfind.library import joint_table
 from scanfind.model import Model, ModelParameters, build_model
 from scanfind.moments import MomentGrid
@@ -23,7 +25,7 @@ from scanfind.scene import GridParameters, Scene, build_scene
 from scanfind.search import Hypotheses, model_arrays
 from scanfind.simulate.parts import blocks
 from scanfind.surface import SurfaceParameters
-from scanfind.verify import distinct
+from scanfind.verify import distinct, spread
 
 Floats = NDArray[np.float64]
 
@@ -42,17 +44,21 @@ def box() -> Model:
     return build_model(mesh, ModelParameters(SurfaceParameters(samples=600)))
 
 
-@cache
-def scene(known: bool = True, noise: float = 0.0) -> Scene:
-    """A box in front of a wall; `known`: where the scanner stood."""
+def points_seen(noise: float = 0.0) -> Floats:
+    """(N, 3) on a box in front of a wall."""
     v, w = (side.ravel() for side in np.meshgrid(*[np.linspace(-HALF_VIEW, HALF_VIEW, 441)] * 2))
     face = BOX_AT - BOX_M / 2
     x = np.where((np.abs(v * face) <= BOX_M / 2) & (np.abs(w * face) <= BOX_M / 2), face, WALL_AT)
     x = x + np.random.default_rng(0).normal(scale=noise, size=len(x))
+    return np.stack([x, v * x, w * x], axis=1)
+
+
+@cache
+def scene(known: bool = True) -> Scene:
+    """A box in front of a wall; `known`: where the scanner stood."""
+    points = points_seen()
     grid = MomentGrid(CELL, np.zeros(3))
-    grid.add(
-        PointChunk(np.stack([x, v * x, w * x], axis=1), {}, np.arange(len(x)), origin=np.zeros(3) if known else None)
-    )
+    grid.add(PointChunk(points, {}, np.arange(len(points)), origin=np.zeros(3) if known else None))
     return build_scene(grid, box().diameter, PARAMETERS.grid, PARAMETERS.search.test_cells_across, 1)
 
 
@@ -145,6 +151,62 @@ def test_what_is_there_scores_above_what_is_not() -> None:
     there, hidden, missing = (weigh(p).score for p in (ON_THE_BOX, (5.0, 0.0, 0.0), (2.0, 0.7, 0.0)))
     assert 0.0 <= missing <= hidden < there <= 1.0
     assert weigh(ON_THE_BOX, known=False).score <= 1.0
+
+
+# ── sparse scans ──
+
+
+@given(*[st.integers(0, 3000)] * 3)
+def test_silent_samples_are_like_those_that_spoke(through: int, hidden: int, silent: int) -> None:
+    told = spread(through, hidden, silent)
+    assert through <= told <= through + silent
+    if not through:
+        assert told == 0
+    elif not hidden:
+        assert told == through + silent
+    else:
+        assert abs(told / (through + hidden + silent) - through / (through + hidden)) <= 0.5 / (through + hidden)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 1.0])
+def test_a_depth_map_speaks_where_its_pixels_are_filled(share: float) -> None:
+    rng = np.random.default_rng(3)
+    filled = rng.random(6 * 360**2) < share
+    depth = DepthMap(np.zeros(3), np.where(filled, 5.0, np.inf).astype(np.float32), 360)
+    # Three of five by chance; at the borders of a face a pixel has fewer beside it.
+    expected = sum(comb(5, k) * share**k * (1.0 - share) ** (5 - k) for k in (3, 4, 5))
+    assert depth.spoken() == pytest.approx(1.0 if share == 0.0 else expected, abs=0.01)
+    (joined,) = joined_until_spoken([depth])
+    assert joined.edge == 360 or depth.spoken() < LEAST_SPOKEN
+    assert joined.edge == 45 or joined.spoken() >= LEAST_SPOKEN
+
+
+def test_thin_places_are_asked_on_the_coarse_level() -> None:
+    # A tenth of the beams: most fine cells on the box are empty, the coarse ones hold a point or two.
+    sparse, dense = (
+        weigh_in(Recognition(at, [box()], joint_table([box()]), PARAMETERS, 0, 1))
+        for at in (thinned(0.04), scene(True))
+    )
+    assert dense[0] == dense[1]
+    assert sparse[0] > 1.3 * sparse[1] > 0
+
+
+def weigh_in(found: Recognition) -> tuple[float, float]:
+    """Support of the box where it is, with and without the coarse level."""
+    pose = Hypotheses(np.zeros(1, np.int64), np.eye(3)[None], np.array([ON_THE_BOX]), np.ones(1))
+    found._fit_near(pose, 2)
+    both, fine = found._evidence(pose, found._fine, found._thin), found._evidence(pose, found._fine)
+    return both[0].support(), fine[0].support()
+
+
+@cache
+def thinned(share: float) -> Scene:
+    """The box before the wall with a share of its beams."""
+    points = points_seen()
+    kept = points[np.random.default_rng(1).random(len(points)) < share]
+    grid = MomentGrid(CELL, np.zeros(3))
+    grid.add(PointChunk(kept, {}, np.arange(len(kept)), origin=np.zeros(3)))
+    return build_scene(grid, box().diameter, PARAMETERS.grid, PARAMETERS.search.test_cells_across, 1)
 
 
 # ── one pose of many alike ──

@@ -73,9 +73,9 @@ class Scene:
 
     fine : cells for drawing, verification and ICP, fitted where they are asked for
     coarse : cells of twice the edge, for ICP's first steps; around : of four times, for the shape around a cell
-    tolerant : cells for the sequential test
+    tolerant : cells for the sequential test, at least four times as large as the fine ones
     depths : what each known scanner position saw; empty where none is known
-    noise : spread of raw points across the median surfel: the scanner's noise, metres (see `quiet`)
+    noise : spread of raw points across the median surfel: the scanner's noise, metres (see `noise_of`)
     points, unaddressable : raw points in the grid, and those too far from the rest to be
     """
 

@@ -68,7 +68,7 @@ class SearchParameters:
     max_tries : places tried for s2 before another s1 is drawn
     tests : model samples in the sequential test
     chance_overlap : share of samples of a wrong hypothesis that lie on the scene, for Wald's test
-    test_cells_across : cells of the test along the diameter of the smallest model
+    test_cells_across : cells of the test along the smallest diameter of a model; fewer where the scan is sparse
     kept : hypotheses refined each round, for each model
     """
 
