@@ -7,7 +7,7 @@ from math import cos, floor, pi, sin, sqrt
 import numpy as np
 from numba import njit
 
-from scanfind.kernels.blocks import find_block, pack_block, unpack_block
+from scanfind.kernels.blocks import find_block, insert_block, pack_block, unpack_block
 from scanfind.kernels.features import angle_between, feature_key
 from scanfind.kernels.grid import cube_pixel
 from scanfind.kernels.pair_pose import frame_of_pair, place_pair, pose_from_frames, refine_four_points
@@ -187,12 +187,7 @@ def mark_orientations(means, normals, reach, cell, spread, signed, hash_keys, ha
                 counts[0] += 1
                 block_keys[block] = key
                 masks[block, :] = 0
-                at = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-                slot = np.int64((at >> np.uint64(24)) & np.uint64(hash_keys.shape[0] - 1))
-                while hash_keys[slot] != -1:
-                    slot = (slot + 1) & (hash_keys.shape[0] - 1)
-                hash_keys[slot] = key
-                hash_values[slot] = block
+                insert_block(hash_keys, hash_values, key, block)
             masks[block, ((cx & 7) << 6) | ((cy & 7) << 3) | (cz & 7)] |= mask
     counts[1] = means.shape[0]
     return means.shape[0]

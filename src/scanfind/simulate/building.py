@@ -15,7 +15,7 @@ from scanfind.simulate.layout import Floor, Layout, at, targets_of
 from scanfind.simulate.objects import box_frame
 from scanfind.simulate.parts import assemble, blocks
 from scanfind.simulate.scene import Scene
-from scanfind.simulate.stations import LEAST_VISIBLE, best_stations, free_spots
+from scanfind.simulate.stations import manned
 from scanfind.simulate.steel import along, hollow_beam, i_beam
 
 FRAME_M = (22.0, 14.0, 8.4)
@@ -43,11 +43,8 @@ def frame(
         if not all(layout.add_target(mesh) for mesh in targets for _ in range(copies)):
             continue
         _furnish(layout, stacks)
-        unmanned = Scene(tuple(layout.objects), np.zeros((0, 3)))
-        spots = free_spots(layout.room, layout.floors, layout.rngs["stations"])
-        where, seen = best_stations(unmanned, spots, stations)
-        if seen.min() >= LEAST_VISIBLE:
-            return Scene(unmanned.objects, where)
+        if scene := manned(layout, stations):
+            return scene
     msg = f"no place in the frame of {FRAME_M} m for {copies} x {[mesh.name for mesh in targets]} in sight; give fewer"
     raise UsageError(msg)
 

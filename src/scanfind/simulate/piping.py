@@ -18,7 +18,7 @@ from scanfind.simulate.layout import TRIES, Layout, at, targets_of, yaw
 from scanfind.simulate.objects import RIGHT_ANGLE, Route, other_spool, pipe_spool
 from scanfind.simulate.parts import assemble, blocks
 from scanfind.simulate.scene import Scene
-from scanfind.simulate.stations import LEAST_VISIBLE, best_stations, free_spots
+from scanfind.simulate.stations import manned
 from scanfind.simulate.steel import hollow_beam, i_beam
 
 Floats = NDArray[np.float64]
@@ -72,11 +72,8 @@ def plant(
         if not all(layout.add_target(mesh) for mesh in targets for _ in range(copies)):
             continue
         _furnish(layout, spools)
-        unmanned = Scene(tuple(layout.objects), np.zeros((0, 3)))
-        spots = free_spots(layout.room, layout.floors, layout.rngs["stations"])
-        where, seen = best_stations(unmanned, spots, stations)
-        if seen.min() >= LEAST_VISIBLE:
-            return Scene(unmanned.objects, where)
+        if scene := manned(layout, stations):
+            return scene
     msg = f"no place in the plant of {PLANT_M} m for {copies} x {[mesh.name for mesh in targets]} in sight; give fewer"
     raise UsageError(msg)
 

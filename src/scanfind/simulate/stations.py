@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.errors import UsageError
-from scanfind.simulate.layout import Floor
+from scanfind.simulate.layout import Floor, Layout
 from scanfind.simulate.placement import Occupancy, sample_points
 from scanfind.simulate.scene import Scene
 
@@ -21,6 +21,13 @@ SCANNER_NEAR_M = 1.1
 LEAST_VISIBLE = 0.3
 # Candidates tried, and points of each target's surface they are judged by: shares within 2 %.
 SPOTS, SAMPLES = 80, 1500
+
+
+def manned(layout: Layout, count: int) -> Scene | None:
+    """A filled place with `count` scanners where they see most; None if less than LEAST_VISIBLE of a target is seen."""
+    unmanned = Scene(tuple(layout.objects), np.zeros((0, 3)))
+    where, seen = best_stations(unmanned, free_spots(layout.room, layout.floors, layout.rngs["stations"]), count)
+    return Scene(unmanned.objects, where) if seen.min() >= LEAST_VISIBLE else None
 
 
 def scanner_fits(room: Occupancy, foot: Floats) -> bool:
