@@ -202,6 +202,7 @@ def _facts(model: Model) -> dict[str, Any]:
         "triangles": len(model.mesh.faces) if model.mesh else 0,
         "parameters": asdict(model.parameters),
         "placements": [_placement_facts(placement) for placement in model.placements],
+        "parts": list(model.mesh.notes.get("parts", ())) if model.mesh else [],
     }
 
 
@@ -249,7 +250,9 @@ def _model(record: Record, arrays: Mapping[str, NDArray[Any]]) -> Model:
     if "faces" in arrays:
         vertices = _shaped(arrays["vertices"], np.float64, (-1, 3))
         faces = _within(_shaped(arrays["faces"], np.int32, (-1, 3)), len(vertices))
-        mesh = Mesh(record.name, vertices, faces, facts["source"], placements)
+        # A library written before parts were kept has none.
+        parts = tuple((str(name), int(first), int(end)) for name, first, end in facts.get("parts", ()))
+        mesh = Mesh(record.name, vertices, faces, facts["source"], placements, {"parts": parts} if parts else {})
     else:
         origin = _shaped(arrays["origin"], np.float64, (3,)) if "origin" in arrays else None
         cloud = CloudModel(record.name, _shaped(arrays["cloud"], np.float64, (-1, 3)), facts["source"], origin)

@@ -92,8 +92,9 @@ def build_model(model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS
     """Sample a model's surface and hash its pairs (Algorithm 1). Raises InvalidGeometryError."""
     if isinstance(model, Mesh):
         surface = sample_mesh(model, parameters.surface)
-        # Notes are for the person who reads the file; the library keeps what the search needs.
-        mesh, cloud = Mesh(model.name, model.vertices, model.faces, model.source, model.placements), None
+        # Of the notes, which are for the person who reads the file, the library keeps what the fit of parts needs.
+        notes = {key: model.notes[key] for key in ("parts",) if key in model.notes}
+        mesh, cloud = Mesh(model.name, model.vertices, model.faces, model.source, model.placements, notes), None
     else:
         surface = sample_cloud(model, parameters.surface)
         mesh, cloud = None, model

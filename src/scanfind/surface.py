@@ -109,7 +109,7 @@ def _visible_candidates(mesh: Mesh, parameters: SurfaceParameters, rng: np.rando
     sight = _Sight(mesh, parameters.directions)
     points, normals, found = [], [], 0
     for _ in range(MAX_ROUNDS):
-        p, n = _random_points(mesh, DARTS_PER_SAMPLE * parameters.samples, rng)
+        p, n = random_points(mesh, DARTS_PER_SAMPLE * parameters.samples, rng)
         # Where both sides may be seen it need not be told by how much, which spares half of the rays.
         enough = parameters.min_visible if parameters.two_sided else 1.0
         front, back = (sight.free_shares(p, side, enough) for side in (n, -n))
@@ -131,7 +131,7 @@ def _visible_candidates(mesh: Mesh, parameters: SurfaceParameters, rng: np.rando
     return OrientedCloud(np.concatenate(points)[order], np.concatenate(normals)[order])
 
 
-def _random_points(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+def random_points(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Points spread over the surface by area and the normals of their faces, (count, 3) each."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     crosses = np.cross(b - a, c - a)
