@@ -39,6 +39,36 @@ class Deviation:
 
 
 @dataclass(frozen=True, eq=False)
+class PartFit:
+    """One part of a found assembly, measured against the parts that keep to the design; all in the model's frame.
+
+    status : "measured"; "missing": beams passed through most of it; "not_seen": too little of it was looked at to say
+    joined_to : the part it hangs on; None for the one all others hang on
+    built_from_design : what moves the part's design to where it was built, but for what the data do not fix
+    shift_m : (3,) of the part's middle; turn_rad : axis × angle (3,)
+    off_m : how far the point of the part's surface that moved the most did
+    shift_sigma_m, turn_sigma_rad : one standard deviation in the worst direction of those the data fix
+    free : motions of the part the data do not fix: shift and turn hold none of them
+    support, visible_support, penalty : as of a detection, of the part's surface alone
+    Not measured: no motion, and NaN for off_m and both deviations.
+    """
+
+    name: str
+    status: str
+    joined_to: str | None
+    built_from_design: Pose
+    shift_m: tuple[float, float, float]
+    turn_rad: tuple[float, float, float]
+    off_m: float
+    shift_sigma_m: float
+    turn_sigma_rad: float
+    free: tuple[Motion, ...]
+    support: float
+    visible_support: float
+    penalty: float
+
+
+@dataclass(frozen=True, eq=False)
 class IsolatedPoints:
     """The raw points of one detection with all their attributes.
 
@@ -70,6 +100,7 @@ class Detection:
     coverage : share of the model's surface the scan shows, 0 … 1
     rms_m : root mean square distance of supported samples to the scene's surface
     unobservable : motions the data do not fix
+    parts : of an assembly, each measured by itself; empty where that was not asked for or it has but one
     """
 
     id: int
@@ -84,6 +115,7 @@ class Detection:
     unobservable: tuple[Motion, ...] = ()
     isolated: IsolatedPoints | None = None
     deviation: Deviation | None = None
+    parts: tuple[PartFit, ...] = ()
 
     def with_points(self, isolated: IsolatedPoints, deviation: Deviation | None) -> Detection:
         """The same detection with its isolated points."""

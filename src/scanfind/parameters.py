@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from scanfind.assembly.parameters import AssemblyParameters
 from scanfind.errors import require
 from scanfind.pairs import PairParameters
 from scanfind.refine import RefineParameters
@@ -42,6 +43,7 @@ class Parameters:
     refine: RefineParameters = field(default_factory=RefineParameters)
     verify: VerifyParameters = field(default_factory=VerifyParameters)
     isolate: IsolationParameters = field(default_factory=IsolationParameters)
+    assembly: AssemblyParameters = field(default_factory=AssemblyParameters)
 
 
 PRESETS = {

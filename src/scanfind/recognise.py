@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.detection import Detection, Motion, Refused
+from scanfind.assembly import Assemblies, View
+from scanfind.detection import Detection, Motion, PartFit, Refused
 from scanfind.pose import Pose
 from scanfind.refine import Refined, icp, shrinking, unobservable
 from scanfind.search import AREA_OF_A_SAMPLE, Hypotheses, Search, model_arrays
@@ -56,6 +57,7 @@ class Candidate(NamedTuple):
     hessian : (6, 6) of ICP, see Refined
     score : 0 … 1; area : supported surface, counted by how much it tells, less what was seen through, m²: by it
         conflicting poses are ranked
+    parts : where its parts are, of a pose that is believed by them alone
     """
 
     model: int
@@ -65,6 +67,7 @@ class Candidate(NamedTuple):
     evidence: Evidence
     score: float
     area: float
+    parts: tuple[PartFit, ...] = ()
 
 
 class Recognition:
@@ -92,6 +95,9 @@ class Recognition:
         self._apart_before, self._apart_after = diameters / 30.0, diameters / 100.0
         self._drawn_in = diameters / 10.0
         self._similar: dict[int, list[Pose]] = {}
+        view = View(scene, self._fine, self._thin, self._rough, self.signed, parameters.verify, jobs)
+        self._assemblies = Assemblies(models, view, parameters.assembly, self.blind)
+        self._tried_in_parts: list[Candidate] = []
 
     def wants_more(self, seconds: float) -> bool:
         """Is another round worth it: time left, instances wanted, and the chance of having missed one too high?"""
@@ -205,13 +211,16 @@ class Recognition:
         refined : what became of the best of them, see `refine`
         """
         verify, settled = self.parameters.verify, {id(candidate) for candidate in self.believed}
-        fresh = []
+        fresh, refused = [], []
         for candidate in self.candidates(refined):
             reason = why_refused(candidate.evidence, self.blind, verify)
             if reason:
-                self._refused.append((candidate, reason))
+                refused.append((candidate, reason))
             else:
                 fresh.append(candidate)
+        if self.parameters.assembly.parts:
+            fresh += self._explained_by_parts([candidate for candidate, _ in refused], [*self.believed, *fresh])
+        self._refused += refused
         claimed, believed = self._no_rows(), []
         for candidate in sorted([*self.believed, *fresh], key=lambda c: -c.area):
             if self._shares(candidate, claimed):
@@ -228,6 +237,41 @@ class Recognition:
         self.believed = self._shown_alike(believed) if self.blind else believed
         self._refused = closest(self._refused)
         self.search.withdraw(claimed[self.scene.fine.cells.rows])
+
+    def _explained_by_parts(self, refused: Sequence[Candidate], believed: Sequence[Candidate]) -> list[Candidate]:
+        """Those among the best refused that, with each part where it is, the evidence carries."""
+        limits, claimed, found = self.parameters.assembly, self._no_rows(), []
+        for candidate in believed:
+            self._claim(candidate, claimed)
+        tried = dict.fromkeys(range(len(self.models)), 0)
+        for candidate in sorted(refused, key=lambda c: -c.score):
+            model = candidate.model
+            if candidate.score < limits.least_score or tried[model] >= limits.tried or self._shares(candidate, claimed):
+                continue
+            if any(other.model == model and self._coincide(candidate, other) for other in self._tried_in_parts):
+                continue
+            self._tried_in_parts.append(candidate)
+            tried[model] += 1
+            whole = self._assemblies.explain(model, Pose(candidate.rotation, candidate.translation))
+            if whole is None or whole.reason:
+                continue
+            net = whole.evidence.telling - self.parameters.verify.penalty_weight * whole.evidence.penalty()
+            area = net * len(self.models[model].samples) * AREA_OF_A_SAMPLE * self.models[model].spacing ** 2
+            found.append(
+                candidate._replace(
+                    rotation=whole.pose.rotation, translation=whole.pose.translation, evidence=whole.evidence,
+                    score=score(whole.evidence, self.blind, self.parameters.verify), area=area, parts=whole.parts,
+                )
+            )  # fmt: skip
+            self._claim(found[-1], claimed)
+        return found
+
+    def _coincide(self, one: Candidate, other: Candidate) -> bool:
+        """Are two poses of one model so near that the fit of parts would lead both to one place?"""
+        here, there = (
+            outlines(self._placements(c.model, [Pose(c.rotation, c.translation)]), self.arrays) for c in (one, other)
+        )
+        return bool(distances(here[0], there)[0] < self._apart_after[one.model])
 
     def _shown_alike(self, believed: Sequence[Candidate]) -> list[Candidate]:
         """Of each model those that show nearly as much of themselves as the best one: where free space says nothing, a
@@ -299,11 +343,18 @@ class Recognition:
         return [self._detection(number, candidate) for number, candidate in enumerate(ranked, start=1)]
 
     def _detection(self, number: int, found: Candidate) -> Detection:
+        if self.parameters.assembly.parts and not found.parts:
+            whole = self._assemblies.explain(found.model, Pose(found.rotation, found.translation))
+            if whole is not None:
+                found = found._replace(
+                    rotation=whole.pose.rotation, translation=whole.pose.translation, parts=whole.parts
+                )
         seen = found.evidence
         return Detection(
             id=number, model=self.models[found.model].name, scene_from_model=self._pose(found), score=found.score,
             support=seen.support(), visible_support=seen.visible_support(), penalty=seen.penalty(),
             coverage=seen.support(), rms_m=seen.rms, unobservable=self._unobservable(found),
+            parts=found.parts,
         )  # fmt: skip
 
     def _pose(self, found: Candidate) -> Pose:

@@ -1,0 +1,212 @@
+"""What became of each part of a model, and whether the model with its parts where they are explains the scan.
+
+The design's place is that of the parts that keep to it among themselves; every part is measured against it, along what
+the scan fixes and nothing else. A pose refused as a whole is believed when the parts, moved within bounds, are there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.assembly.fit import PartsFit, PlacedParts, View, rotation_vector, skew
+from scanfind.assembly.parts import Assembly, assembly_of
+from scanfind.detection import PartFit
+from scanfind.pose import Pose, nearest_rotation, rotation_from_vector
+from scanfind.refine import triple, unobservable
+from scanfind.verify import Evidence, why_refused
+
+if TYPE_CHECKING:
+    from scanfind.assembly.parameters import AssemblyParameters
+    from scanfind.model import Model
+
+Floats = NDArray[np.float64]
+
+MEASURED, MISSING, NOT_SEEN = "measured", "missing", "not_seen"
+# Fewer supported samples than this many, or than this share, do not measure a part; as many spoken of can miss it.
+LEAST_SUPPORTED, LEAST_SHOWN = 20, 0.08
+THERE = 0.5  # share of what scanners could see of a part that must be there for it to be there
+# Parts whose surface lies within this of where the design puts it, rms, keep to it: as a scan's noise is.
+KEEPS_M = 0.002
+# A motion the data hold less than this share of the mean is free. The model's normals are exact, so what is free here
+# is so by shape: a cylinder's facets hold its roll by 1e-5, the face of a flange its slide by 0.05.
+FREE_BELOW = 0.004
+# Surfels near each other err alike (bent surface, mixed pixels), which their residuals do not show.
+ALIKE_M, ALIKE_SHARE = 1e-4, 3.0
+
+
+class Explained(NamedTuple):
+    """The scan, explained by a model in parts.
+
+    pose : scene_from_model of the parts that keep to the design, relative to the grid's offset
+    parts : one each; evidence : of all, but for missing ones that may be missing
+    reason : why it is not believed, in words; empty where it is
+    """
+
+    pose: Pose
+    parts: tuple[PartFit, ...]
+    evidence: Evidence
+    reason: str
+
+
+class Assemblies:
+    """The models sought, cut into parts where they have them, each cut once."""
+
+    def __init__(self, models: Sequence[Model], view: View, parameters: AssemblyParameters, blind: bool) -> None:
+        self._models, self._view, self._parameters, self._blind = models, view, parameters, blind
+        self._fits: dict[int, PartsFit | None] = {}
+
+    def explain(self, model: int, pose: Pose) -> Explained | None:
+        """Fit the parts of a model placed near `pose`; None where it has but one."""
+        if model not in self._fits:
+            self._fits[model] = self._cut(self._models[model])
+        fit = self._fits[model]
+        return None if fit is None else explained(fit, pose, self._blind)
+
+    def _cut(self, model: Model) -> PartsFit | None:
+        if model.mesh is None:
+            return None
+        surface = replace(model.parameters.surface, samples=self._parameters.samples)
+        assembly = assembly_of(model.mesh, surface)
+        return None if assembly is None else PartsFit(assembly, self._view, self._parameters)
+
+
+def explained(fit: PartsFit, pose: Pose, blind: bool) -> Explained:
+    """What the scan says of a model placed near `pose`, in parts; blind : no scanner position is known."""
+    parts, seen, parents = fit.fit(pose)
+    assembly, parameters, verify = fit.assembly, fit.parameters, fit.view.verify
+    status = [status_of(one) for one in seen]
+    reference, keeps = consensus(parts, seen, status, assembly, pose)
+    told = tuple(
+        told_of(k, parts, seen[k], status[k], int(parents[k]), reference, assembly) for k in range(len(seen))
+    )  # fmt: skip
+    all_seen, kept = sum(one.supported for one in seen), sum(one.supported for one, on in zip(seen, keeps, strict=True) if on)
+    spared = forgiven(assembly, status, seen, parameters.most_missing)
+    evidence = together([one for one, spare in zip(seen, spared, strict=True) if not spare])
+    reason = why_refused(evidence, blind, verify)
+    if not reason and kept < parameters.least_kept * all_seen:
+        reason = f"only {kept / all_seen:.0%} of what is seen of it keeps to the design, {parameters.least_kept:.0%} is asked for"
+    return Explained(reference, told, evidence, reason)
+
+
+def status_of(seen: Evidence) -> str:
+    """Whether a part is measured, missing, or not seen well enough to say."""
+    least = max(LEAST_SUPPORTED, LEAST_SHOWN * seen.samples)
+    if seen.supported >= least and seen.visible_support() >= THERE:
+        return MEASURED
+    return MISSING if seen.seen_through >= least and seen.visible_support() < THERE else NOT_SEEN
+
+
+def consensus(
+    parts: PlacedParts, seen: Sequence[Evidence], status: Sequence[str], assembly: Assembly, pose: Pose
+) -> tuple[Pose, NDArray[np.bool_]]:  # fmt: skip
+    """The pose of the design, scene_from_model, that the most surface keeps to, and which parts do, (P,)."""
+    measured = np.array([one == MEASURED for one in status])
+    weight = np.array([one.supported for one in seen])
+
+    def keeping(reference: Pose) -> NDArray[np.bool_]:
+        off = [off_design(parts, k, reference, assembly) for k in range(len(seen))]
+        return measured & (np.array(off) <= KEEPS_M)
+
+    tried = [pose, *(parts.pose(int(k)) for k in np.flatnonzero(measured))]
+    best = max(tried, key=lambda one: float(weight[keeping(one)].sum()))
+    for _ in range(3):
+        on = keeping(best)
+        better = agreed(parts, np.flatnonzero(on), best, assembly) if on.any() else best
+        if weight[keeping(better)].sum() < weight[on].sum():
+            break
+        best = better
+    return best, keeping(best)
+
+
+def motion_from(parts: PlacedParts, k: int, reference: Pose, assembly: Assembly) -> Floats:
+    """How a part is moved from where `reference` has it: (rotation × radius, translation) of its middle, scene axes."""
+    centre, radius = assembly.arrays.centres[k], assembly.arrays.radii[k]
+    turn = rotation_vector(parts.rotations[k] @ reference.rotation.T)
+    shift = parts.pose(k).move(centre[None])[0] - reference.move(centre[None])[0]
+    return np.concatenate([turn * radius, shift])
+
+
+def off_design(parts: PlacedParts, k: int, reference: Pose, assembly: Assembly) -> float:
+    """How far the seen surface of a part is from where `reference` has it, across itself, rms, metres."""
+    motion, information = motion_from(parts, k, reference, assembly), parts.information[k]
+    matched = float(np.trace(information[3:, 3:]))  # unit normals: the sum of the weights
+    return float(np.sqrt(max(motion @ information @ motion, 0.0) / matched)) if matched > 0.0 else np.inf
+
+
+def agreed(parts: PlacedParts, which: NDArray[np.intp], start: Pose, assembly: Assembly) -> Pose:
+    """The pose that some parts agree on, each as far as the scan fixes it; one step from `start`."""
+    middle = start.move(assembly.arrays.points.mean(axis=0)[None])[0]
+    hessian, gradient = np.zeros((6, 6)), np.zeros(6)
+    for k in which:
+        arm = start.move(assembly.arrays.centres[k][None])[0] - middle
+        lever = np.block([[assembly.arrays.radii[k] * np.eye(3), np.zeros((3, 3))], [-skew(arm), np.eye(3)]])
+        information = parts.information[k] / parts.noise[k] ** 2
+        hessian += lever.T @ information @ lever
+        gradient += lever.T @ information @ motion_from(parts, int(k), start, assembly)
+    # A part that fixes nothing of some motion leaves it where it is.
+    step = np.linalg.solve(hessian + 1e-6 * np.trace(hessian) / 6.0 * np.eye(6), gradient)
+    rotation = nearest_rotation(rotation_from_vector(step[:3]) @ start.rotation)
+    moved = middle + step[3:] + rotation_from_vector(step[:3]) @ (start.translation - middle)
+    return Pose(rotation, moved)
+
+
+def told_of(
+    k: int, parts: PlacedParts, seen: Evidence, status: str, parent: int, reference: Pose, assembly: Assembly
+) -> PartFit:  # fmt: skip
+    """What is reported of one part, in the model's own axes."""
+    joined_to = assembly.names[parent] if parent >= 0 else None
+    shares = (seen.support(), seen.visible_support(), seen.penalty())
+    if status != MEASURED:
+        none = (0.0, 0.0, 0.0)
+        nan = float("nan")
+        return PartFit(assembly.names[k], status, joined_to, Pose.identity(), none, none, nan, nan, nan, (), *shares)
+    centre, radius = assembly.arrays.centres[k], float(assembly.arrays.radii[k])
+    turned = np.kron(np.eye(2), reference.rotation)
+    information = turned.T @ parts.information[k] @ turned
+    values, vectors = np.linalg.eigh(information)
+    held = vectors[:, values >= FREE_BELOW * values.mean()]
+    fixed = held @ held.T
+    motion = fixed @ turned.T @ motion_from(parts, k, reference, assembly)
+    turn, shift = motion[:3] / radius, motion[3:]
+    covariance = held @ np.linalg.inv(held.T @ information @ held) @ held.T * parts.noise[k] ** 2 / parts.share[k]
+    covariance = ALIKE_SHARE * covariance + fixed * ALIKE_M**2
+    sigma_shift = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
+    sigma_turn = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])) / radius
+    rotation = rotation_from_vector(turn)
+    built_from_design = Pose(rotation, centre + shift - rotation @ centre)
+    points = assembly.points(k)
+    return PartFit(
+        assembly.names[k], status, joined_to, built_from_design, triple(shift), triple(turn),
+        float(np.linalg.norm(built_from_design.move(points) - points, axis=1).max()), sigma_shift, sigma_turn,
+        unobservable(information, centre, radius, FREE_BELOW), *shares,
+    )  # fmt: skip
+
+
+def forgiven(
+    assembly: Assembly, status: Sequence[str], seen: Sequence[Evidence], most: float
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Which parts may be missing, (P,): those that join others at two places or more, if they are not too much."""
+    joints = np.zeros(len(status), np.int64)
+    for joint in assembly.joints:
+        joints[[joint.a, joint.b]] += 1
+    spared = np.array([one == MISSING for one in status]) & (joints >= 2)
+    samples = np.array([one.samples for one in seen])
+    return spared if samples[spared].sum() <= most * samples.sum() else np.zeros(len(status), np.bool_)
+
+
+def together(seen: Sequence[Evidence]) -> Evidence:
+    """The evidence of several parts as that of one thing."""
+    samples = sum(one.samples for one in seen)
+    supported = sum(one.supported for one in seen)
+    squares = sum(one.supported * one.rms**2 for one in seen if one.supported)
+    return Evidence(
+        samples, supported, sum(one.seen_through for one in seen), sum(one.hidden for one in seen),
+        sum(one.telling * one.samples for one in seen) / samples,
+        float(np.sqrt(squares / supported)) if supported else float("inf"),
+        np.unique(np.concatenate([one.claims for one in seen])),
+    )  # fmt: skip

@@ -1,0 +1,329 @@
+"""The parts of a placed model, each fitted to the scan as a rigid body that hangs on those it joins.
+
+One step is one of point-to-plane ICP with two changes. Motions are weighed by the model's own normals, which are exact:
+along a straight pipe and about it they have no say at all, where a surfel's normal, wrong by noise, would. And every
+part is tied to where its neighbours would have it, by springs so soft (20 mm, 3°) that any surface that is seen
+outweighs them a thousandfold: they hold what the scan leaves open, and nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.pose import Pose, nearest_rotation, rotation_from_vector
+from scanfind.search import Hypotheses
+from scanfind.verify import Evidence, Level, gather, held_against
+
+if TYPE_CHECKING:
+    from scanfind.assembly.parameters import AssemblyParameters
+    from scanfind.assembly.parts import Assembly, Joint
+    from scanfind.scene import Scene
+    from scanfind.verify import VerifyParameters
+
+Floats = NDArray[np.float64]
+
+# The springs of a joint: a gap and a turn this large cost as much as one standard deviation of the data does.
+SPRING_M, SPRING_RAD = 0.02, np.radians(3.0)
+LEAST_NOISE_M = 5e-4  # of a surfel: a scan that fits better still does not bind a part more
+# From as far as parts may be off to as near as surfels tell; in all 14 steps, of which four suffice for most parts.
+STEPS, LAST_CELLS = 10, 0.5
+NORMALS_AGREE = 0.7  # as in the refinement of whole poses
+# A part that most of its looked-at surface supports where its neighbour has it is where it should be.
+SETTLED = 0.95
+
+
+class View(NamedTuple):
+    """The scene as parts are held against it.
+
+    fine, thin : as whole poses are (see verify.gather); coarse : for steps of several centimetres
+    signed : both sides know which way their normals face; jobs : threads
+    """
+
+    scene: Scene
+    fine: Level
+    thin: Level
+    coarse: Level
+    signed: bool
+    verify: VerifyParameters
+    jobs: int
+
+
+class Hinges(NamedTuple):
+    """K springs: hypothesis `of` is tied at `places` (K, 3), model frame, to where poses of others have these.
+
+    rotations, translations : (K, 3, 3), (K, 3) of the others
+    """
+
+    of: NDArray[np.int64]
+    places: Floats
+    rotations: Floats
+    translations: Floats
+
+
+class PlacedParts(NamedTuple):
+    """H poses of parts: which part, scene_from_model of each, and what the data say of its motions.
+
+    information : (H, 6, 6) in (rotation × radius, translation) about the placed centre, scene axes, each row of a
+        matched sample of unit weight; noise : (H,) rms of these, metres; share : (H,) distinct surfels a match
+    """
+
+    numbers: NDArray[np.int64]
+    rotations: Floats
+    translations: Floats
+    information: Floats
+    noise: Floats
+    share: Floats
+
+    def pose(self, k: int) -> Pose:
+        """scene_from_model of the k-th."""
+        return Pose(self.rotations[k], self.translations[k])
+
+    def take(self, which: NDArray[np.integer] | list[int]) -> PlacedParts:
+        """Some of them."""
+        return PlacedParts(*(column[which] for column in self))
+
+
+class PartsFit:
+    """Fits the parts of one assembly to one scene."""
+
+    def __init__(self, assembly: Assembly, view: View, parameters: AssemblyParameters) -> None:
+        self.assembly, self.view, self.parameters = assembly, view, parameters
+        self._sizes = assembly.samples()
+        # Correspondences need no depth maps: without them the kernel asks no beams.
+        self._unseeing = replace(view.scene, depths=[])
+
+    def fit(self, pose: Pose) -> tuple[PlacedParts, list[Evidence], NDArray[np.int64]]:
+        """The parts of a model placed at `pose` where the scan has them; what it says of each; their parents, (P,).
+
+        From the part with the most evidence outwards: each begins where the one before it would have it, and where
+        that explains it badly, it is also tried bent and slid about the joint. Then all are fitted together.
+        """
+        self._reach(pose)
+        count = len(self.assembly.names)
+        start = placed(np.arange(count), [pose] * count)
+        seen = self.evidence(start)
+        root = int(np.argmax([one.supported for one in seen]))
+        order, parents, places = self._tree(root)
+        poses = [pose] * count
+        for part in order:
+            before = poses[parents[part]] if parents[part] >= 0 else pose
+            poses[part] = self._one(part, before, places[part])
+        together = self._together(placed(np.arange(count), poses))
+        return together, self.evidence(together), parents
+
+    def evidence(self, parts: PlacedParts) -> list[Evidence]:
+        """What the scene says of each placed part."""
+        at, view = hypotheses(parts), self.view
+        arrays, jobs = self.assembly.arrays, view.jobs
+        return gather(at, view.scene, view.fine, view.thin, arrays, view.signed, view.verify, jobs)
+
+    def _reach(self, pose: Pose) -> None:
+        """Fit the surfels as far around a pose as its parts may be off."""
+        from scanfind.kernels.nearest import mark_around
+
+        fine = self.view.scene.fine
+        at, points = fine.cells, pose.move(self.assembly.arrays.points)
+        near = np.zeros(len(fine.sides), np.bool_)
+        # Twice: a part may be off, and what hangs on it swings out farther.
+        reach = int(np.ceil(2.0 * self.parameters.most_shift_m / at.cell)) + 1
+        mark_around(points, reach, at.cell, at.hash_keys, at.hash_values, at.block_rows, near)
+        fine.fit(near[at.rows])
+
+    def _tree(self, root: int) -> tuple[list[int], NDArray[np.int64], Floats]:
+        """Parts from the root outwards, the parent of each (-1: none) and the place of their joint, (P, 3)."""
+        count = len(self.assembly.names)
+        parents, places = np.full(count, -1), self.assembly.arrays.centres.copy()
+        order, left = [root], set(range(count)) - {root}
+        while left:
+            nearest = max(
+                (joint for joint in self.assembly.joints if (joint.a in left) != (joint.b in left)),
+                key=lambda joint: joint.points, default=None,
+            )  # fmt: skip
+            if nearest is None:  # pieces that touch nothing hang on the root
+                part = min(left)
+                parents[part] = root
+            else:
+                part, parent = (nearest.a, nearest.b) if nearest.a in left else (nearest.b, nearest.a)
+                parents[part], places[part] = parent, nearest.place
+            order.append(part)
+            left.remove(part)
+        return order, parents, places
+
+    def _one(self, part: int, before: Pose, place: Floats) -> Pose:
+        """Where a part is that its neighbour would have at `before`, scene_from_model, joined at `place` (3,)."""
+        first = self._settle(placed(np.array([part]), [before]), before, place)
+        seen = self.evidence(first)[0]
+        enough = self.view.verify.min_support * seen.samples
+        if seen.supported >= enough and seen.visible_support() >= SETTLED and self._near(first.pose(0), before, place):
+            return first.pose(0)
+        moves = self._trials(part, place)
+        tried = self._settle(placed(np.full(len(moves), part), [before @ move for move in moves]), before, place)
+        tried = PlacedParts(*(np.concatenate(pair) for pair in zip(first, tried, strict=True)))
+        weight = self.view.verify.penalty_weight
+        best, most = before, -np.inf
+        for k, found in enumerate(self.evidence(tried)):
+            if not self._near(tried.pose(k), before, place):
+                continue
+            # Of poses that explain the same, the one nearer to the design: a tenth of the samples for all of the way.
+            gap, turn = apart(tried.pose(k), before, place)
+            strain = gap / self.parameters.most_shift_m + np.degrees(turn) / self.parameters.most_turn_deg
+            value = found.supported - weight * found.seen_through - 0.05 * strain * found.samples
+            if value > most:
+                best, most = tried.pose(k), value
+        return best
+
+    def _trials(self, part: int, place: Floats) -> list[Pose]:
+        """Motions of a part, model frame, about a joint: bent either way about two axes, slid along three."""
+        along = self.assembly.arrays.centres[part] - place
+        if np.linalg.norm(along) < 1e-6:
+            along = np.array([0.0, 0.0, 1.0])
+        along = along / np.linalg.norm(along)
+        axes = np.linalg.svd(along[None])[2]
+        turn, slide = np.radians(0.7 * self.parameters.most_turn_deg), 0.6 * self.parameters.most_shift_m
+        moves = [Pose(np.eye(3), sign * slide * axis) for axis in axes for sign in (1.0, -1.0)]
+        for axis in axes[1:]:
+            for sign in (1.0, -1.0):
+                rotation = rotation_from_vector(sign * turn * axis)
+                moves.append(Pose(rotation, place - rotation @ place))
+        return moves
+
+    def _near(self, pose: Pose, before: Pose, place: Floats) -> bool:
+        gap, turn = apart(pose, before, place)
+        return gap <= self.parameters.most_shift_m and np.degrees(turn) <= self.parameters.most_turn_deg
+
+    def _settle(self, parts: PlacedParts, before: Pose, place: Floats) -> PlacedParts:
+        """Fit several poses of parts, each by itself, tied to where `before` has `place`."""
+        count = len(parts.numbers)
+        hinges = Hinges(
+            np.arange(count), np.tile(place, (count, 1)), np.tile(before.rotation, (count, 1, 1)),
+            np.tile(before.translation, (count, 1)),
+        )  # fmt: skip
+        for level, gate in self._gates():
+            parts = self._step(parts, level, gate, hinges)
+        return parts
+
+    def _together(self, parts: PlacedParts) -> PlacedParts:
+        """Fit all parts at once, each tied to where its neighbours are at the step before."""
+        joints = [tied for joint in self.assembly.joints for tied in ((joint.a, joint.b), (joint.b, joint.a))]
+        of, others = np.array(joints, np.int64).reshape(-1, 2).T
+        places = np.repeat(np.array([joint.place for joint in self.assembly.joints]).reshape(-1, 3), 2, axis=0)
+        fine = self.view.fine
+        for gate in np.geomspace(1.0, LAST_CELLS, STEPS) * fine.surfels.cell:
+            hinges = Hinges(of, places, parts.rotations[others], parts.translations[others])
+            parts = self._step(parts, fine, max(gate, 3.0 * self.view.scene.noise), hinges)
+        return parts
+
+    def _gates(self) -> list[tuple[Level, float]]:
+        """Levels and gates, metres, of the steps of a part by itself."""
+        coarse, fine = self.view.coarse, self.view.fine
+        far = min(0.75 * self.parameters.most_shift_m, 4.0 * coarse.surfels.cell)
+        near = min(1.2 * fine.surfels.cell, far)
+        wide = [(coarse, float(gate)) for gate in np.geomspace(far, near, STEPS)]
+        return wide + [(fine, float(gate)) for gate in np.geomspace(near, 0.6 * near, STEPS // 2)]
+
+    def _step(self, parts: PlacedParts, level: Level, gate: float, hinges: Hinges) -> PlacedParts:
+        """One Gauss-Newton step of each part."""
+        surfels, arrays = level.surfels, self.assembly.arrays
+        sizes = self._sizes[parts.numbers]
+        rules = replace(
+            self.view.verify, gate_cells=min(4.0, gate / surfels.cell), normal_agreement=NORMALS_AGREE
+        )
+        _, _, claims = held_against(
+            hypotheses(parts), self._unseeing, level._replace(inlier=gate), sizes, arrays, self.view.signed, rules,
+            self.view.jobs,
+        )  # fmt: skip
+        tied, pull = springs(parts, hinges, arrays.centres, arrays.radii)
+        rotations, translations = parts.rotations.copy(), parts.translations.copy()
+        information, noise, share = np.zeros_like(parts.information), parts.noise.copy(), parts.share.copy()
+        ends = np.cumsum(sizes)
+        for h, (number, end) in enumerate(zip(parts.numbers, ends, strict=True)):
+            claim = claims[end - sizes[h] : end]
+            on = np.flatnonzero(claim >= 0)
+            base, centre, radius = arrays.starts[number], arrays.centres[number], arrays.radii[number]
+            rotation = rotations[h]
+            middle = rotation @ centre + translations[h]
+            rows, gap, weight = matches(
+                arrays.points[base + on] @ rotation.T + translations[h], arrays.normals[base + on] @ rotation.T,
+                surfels.means[claim[on]], surfels.normals[claim[on]], middle, radius, gate,
+            )  # fmt: skip
+            information[h] = (rows * weight[:, None]).T @ rows
+            total = float(weight.sum())
+            noise[h] = max(LEAST_NOISE_M, np.sqrt((weight * gap * gap).sum() / total)) if total > 0.0 else gate
+            share[h] = len(np.unique(claim[on])) / len(on) if len(on) else 1.0
+            precision = share[h] / noise[h] ** 2
+            # A thousandth of one match in a thousand, as in ICP of whole poses: a part that hangs on nothing stays.
+            hessian = precision * information[h] + tied[h] + 1e-6 * (precision * total + 1.0) * np.eye(6)
+            step = np.linalg.solve(hessian, precision * (rows.T @ (weight * gap)) + pull[h])
+            rotations[h] = nearest_rotation(rotation_from_vector(step[:3] / radius) @ rotation)
+            translations[h] = middle + step[3:] - rotations[h] @ centre
+        return PlacedParts(parts.numbers, rotations, translations, information, noise, share)
+
+
+def matches(
+    points: Floats, normals: Floats, means: Floats, directions: Floats, middle: Floats, radius: float, gate: float
+) -> tuple[Floats, Floats, Floats]:
+    """Of N placed samples and the surfels they meet: rows (N, 6) of the motions, gaps (N,), Tukey's weights (N,).
+
+    The gap is measured along the mean of both normals: of a bent surface a sample beside its surfel lies as far
+    beneath the one's plane as above the other's (Rusinkiewicz 2019).
+    """
+    sides = np.where((normals * directions).sum(axis=1) < 0.0, -1.0, 1.0)
+    between = normals + sides[:, None] * directions
+    between /= np.maximum(np.linalg.norm(between, axis=1), 1e-12)[:, None]
+    gap = ((means - points) * between).sum(axis=1)
+    weight = np.maximum(1.0 - (gap / gate) ** 2, 0.0) ** 2
+    return np.hstack([np.cross(points - middle, normals) / radius, normals]), gap, weight
+
+
+def springs(parts: PlacedParts, hinges: Hinges, centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
+    """The hessian (H, 6, 6) and the pull (H, 6) of the springs on each part, about its placed centre."""
+    hessian, pull = np.zeros((len(parts.numbers), 6, 6)), np.zeros((len(parts.numbers), 6))
+    for of, place, rotation, translation in zip(*hinges, strict=True):
+        number = parts.numbers[of]
+        radius, mine = radii[number], parts.pose(int(of))
+        arm = mine.rotation @ (place - centres[number])
+        gap = rotation @ place + translation - mine.move(place[None])[0]
+        rows = np.hstack([-skew(arm) / radius, np.eye(3)]) / SPRING_M
+        turning = np.hstack([np.eye(3) / radius, np.zeros((3, 3))]) / SPRING_RAD
+        hessian[of] += rows.T @ rows + turning.T @ turning
+        pull[of] += rows.T @ (gap / SPRING_M) + turning.T @ (rotation_vector(rotation @ mine.rotation.T) / SPRING_RAD)
+    return hessian, pull
+
+
+def skew(vector: Floats) -> Floats:
+    """The matrix (3, 3) whose product with another vector is the cross product of the two."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def rotation_vector(rotation: Floats) -> Floats:
+    """Axis × angle (3,), radians, of a rotation (3, 3) of less than half a turn."""
+    twice = np.array([
+        rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]
+    ])  # fmt: skip
+    sine = float(np.linalg.norm(twice))
+    angle = float(np.arctan2(sine, np.trace(rotation) - 1.0))
+    vector: Floats = twice * (0.5 if sine < 1e-9 else angle / sine)
+    return vector
+
+
+def apart(pose: Pose, other: Pose, place: Floats) -> tuple[float, float]:
+    """How far two poses part a place (3,) of the model, metres, and how far they turn against each other, radians."""
+    gap = float(np.linalg.norm(pose.move(place[None]) - other.move(place[None])))
+    return gap, pose.difference(other)[1]
+
+
+def placed(numbers: NDArray[np.int64], poses: list[Pose]) -> PlacedParts:
+    """Parts at poses of which nothing is known yet."""
+    count = len(numbers)
+    rotations, translations = np.array([p.rotation for p in poses]), np.array([p.translation for p in poses])
+    return PlacedParts(numbers, rotations, translations, np.zeros((count, 6, 6)), np.ones(count), np.ones(count))
+
+
+def hypotheses(parts: PlacedParts) -> Hypotheses:
+    """As the kernels of verification take them."""
+    return Hypotheses(parts.numbers, parts.rotations, parts.translations, np.ones(len(parts.numbers)))
