@@ -95,7 +95,7 @@ class Recognition:
         self._apart_before, self._apart_after = diameters / 30.0, diameters / 100.0
         self._drawn_in = diameters / 10.0
         self._similar: dict[int, list[Pose]] = {}
-        view = View(scene, self._fine, self._thin, self._rough, self.signed, parameters.verify, jobs)
+        view = View(scene, self._fine, self._thin, self.signed, parameters.verify, jobs)
         self._assemblies = Assemblies(models, view, parameters.assembly, self.blind)
         self._tried_in_parts: list[Candidate] = []
 

@@ -39,14 +39,13 @@ SETTLED = 0.95
 class View(NamedTuple):
     """The scene as parts are held against it.
 
-    fine, thin : as whole poses are (see verify.gather); coarse : for steps of several centimetres
+    fine, thin : as whole poses are (see verify.gather); thin, which is coarser, for steps of several centimetres too
     signed : both sides know which way their normals face; jobs : threads
     """
 
     scene: Scene
     fine: Level
     thin: Level
-    coarse: Level
     signed: bool
     verify: VerifyParameters
     jobs: int
@@ -219,7 +218,7 @@ class PartsFit:
 
     def _gates(self) -> list[tuple[Level, float]]:
         """Levels and gates, metres, of the steps of a part by itself."""
-        coarse, fine = self.view.coarse, self.view.fine
+        coarse, fine = self.view.thin, self.view.fine
         far = min(0.75 * self.parameters.most_shift_m, 4.0 * coarse.surfels.cell)
         near = min(1.2 * fine.surfels.cell, far)
         wide = [(coarse, float(gate)) for gate in np.geomspace(far, near, STEPS)]
