@@ -128,7 +128,7 @@ def scene_row(seed: int, kind: str, points: int, *, rigid: bool) -> Row:
     scanned = scan(scene, seed=seed, points=points)
     default = scanfind.PRESETS["default"]
     parameters = replace(default, assembly=AssemblyParameters(parts=not rigid))
-    found = scanfind.find(scanned.stations, case.design, parameters=parameters, seed=seed, isolate=False)
+    found = scanfind.find(scanned.stations, case.design, parameters=parameters, seed=seed)
     truth, centre = scanned.truth[case.built.name][0], centre_of(case.design.vertices)
     errors = [pose_error(one.scene_from_model, truth, centre) for one in found]
     right = [k for k, error in enumerate(errors) if error.within(FOUND_MM, FOUND_DEG) and kind != "sibling"]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from scanfind.clock import Clock, say_if_compiling, watched
 from scanfind.cloud import CloudModel, PointChunk, shift_for
@@ -21,7 +21,7 @@ from scanfind.library import ModelLibrary, joint_table
 from scanfind.mesh import Mesh
 from scanfind.model import Model, ModelParameters
 from scanfind.moments import MomentGrid
-from scanfind.near_surface import near_model
+from scanfind.near_surface import near_model, near_triangles
 from scanfind.parameters import PRESETS, IsolationParameters, Parameters
 from scanfind.recognise import Recognition
 from scanfind.scene import build_scene, first_cell
@@ -30,9 +30,12 @@ from scanfind.threads import available_cores
 
 if TYPE_CHECKING:
     from scanfind.detection import Detection
+    from scanfind.kernels.distance import NearSurface
+    from scanfind.pose import Pose
     from scanfind.progress import Progress
     from scanfind.scans import CloudWriter
 
+Floats: TypeAlias = NDArray[np.float64]
 ModelInput: TypeAlias = "ModelLibrary | Mesh | CloudModel | str | PathLike[str]"
 
 
@@ -106,7 +109,8 @@ def find(
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
             tolerance = isolation_tolerance(parameters.isolate, found.noise(), scene.fine.cell)
             findings.tolerance_m = tolerance
-            findings[:] = with_points(findings, library, chunks, tolerance, remainder, jobs)
+            isolated = with_points(findings, library, found.built(), chunks, tolerance, remainder, jobs)
+            findings[:] = [found.measured(one, tolerance) for one in isolated]  # each part by its own points
     findings.scans = [source.told() for source in sources.all]
     findings.crs, findings.notes = sources.crs(), found.notes()
     findings.shift = tuple(shift_for(scene.fine.cells.offset).tolist())
@@ -163,22 +167,37 @@ def isolation_tolerance(parameters: IsolationParameters, noise: float, cell: flo
 
 
 def with_points(
-    findings: Sequence[Detection], library: Sequence[Model], chunks: Iterable[PointChunk], tolerance: float,
-    remainder: CloudWriter | None, jobs: int,
+    findings: Sequence[Detection], library: Sequence[Model], built: Mapping[int, Floats],
+    chunks: Iterable[PointChunk], tolerance: float, remainder: CloudWriter | None, jobs: int,
 ) -> list[Detection]:  # fmt: skip
-    """Each detection with its raw points and how far they are from its model."""
+    """Each detection with its raw points and how far they are from its model.
+
+    built : the faces (F, 3, 3) of detections fitted in parts, by id, scan frame: what their points are cut and
+        measured by
+    """
     surfaces = {
         model.name: near_model(model, tolerance)
         for model in library
         if any(found.model == model.name for found in findings)
     }
-    placed = [Placed(found.id, surfaces[found.model], found.scene_from_model) for found in findings]
+    placed = [
+        Placed(found.id, near_built(built[found.id], found.scene_from_model, tolerance), found.scene_from_model)
+        if found.id in built
+        else Placed(found.id, surfaces[found.model], found.scene_from_model)
+        for found in findings
+    ]
     rest = None if remainder is None else lambda chunk: write_rest(remainder, chunk)
     points = isolate_raw(chunks, placed, IsolateParameters(tolerance), remainder=rest, jobs=jobs)
     return [
         found.with_points(cut := points[found.id], deviation_of(cut.deviation) if len(cut) else None)
         for found in findings
     ]
+
+
+def near_built(faces: Floats, scene_from_model: Pose, tolerance: float) -> NearSurface:
+    """The surface of a detection as built; faces (F, 3, 3), scan frame."""
+    # In the model's frame: far from zero single precision would round the tree of boxes.
+    return near_triangles(scene_from_model.inverse().move(faces.reshape(-1, 3)).reshape(-1, 3, 3), tolerance)
 
 
 def write_rest(writer: CloudWriter, chunk: PointChunk) -> None:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import ceil, log
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.assembly import Assemblies, View
-from scanfind.detection import Detection, Motion, PartFit, Refused
+from scanfind.assembly import Assemblies, Explained, View
+from scanfind.detection import Detection, Motion, Refused
 from scanfind.pose import Pose
 from scanfind.refine import Refined, icp, shrinking, unobservable
 from scanfind.search import AREA_OF_A_SAMPLE, Hypotheses, Search, model_arrays
@@ -57,7 +58,7 @@ class Candidate(NamedTuple):
     hessian : (6, 6) of ICP, see Refined
     score : 0 … 1; area : supported surface, counted by how much it tells, less what was seen through, m²: by it
         conflicting poses are ranked
-    parts : where its parts are, of a pose that is believed by them alone
+    whole : its parts, where they were fitted: of a pose that is believed by them alone
     """
 
     model: int
@@ -67,7 +68,7 @@ class Candidate(NamedTuple):
     evidence: Evidence
     score: float
     area: float
-    parts: tuple[PartFit, ...] = ()
+    whole: Explained | None = None
 
 
 class Recognition:
@@ -98,6 +99,7 @@ class Recognition:
         view = View(scene, self._fine, self._thin, self.signed, parameters.verify, jobs)
         self._assemblies = Assemblies(models, view, parameters.assembly, self.blind)
         self._tried_in_parts: list[Candidate] = []
+        self._in_parts: dict[int, tuple[int, Explained]] = {}
 
     def wants_more(self, seconds: float) -> bool:
         """Is another round worth it: time left, instances wanted, and the chance of having missed one too high?"""
@@ -260,7 +262,7 @@ class Recognition:
             found.append(
                 candidate._replace(
                     rotation=whole.pose.rotation, translation=whole.pose.translation, evidence=whole.evidence,
-                    score=score(whole.evidence, self.blind, self.parameters.verify), area=area, parts=whole.parts,
+                    score=score(whole.evidence, self.blind, self.parameters.verify), area=area, whole=whole,
                 )
             )  # fmt: skip
             self._claim(found[-1], claimed)
@@ -343,19 +345,34 @@ class Recognition:
         return [self._detection(number, candidate) for number, candidate in enumerate(ranked, start=1)]
 
     def _detection(self, number: int, found: Candidate) -> Detection:
-        if self.parameters.assembly.parts and not found.parts:
+        whole = found.whole
+        if self.parameters.assembly.parts and whole is None:
             whole = self._assemblies.explain(found.model, Pose(found.rotation, found.translation))
-            if whole is not None:
-                found = found._replace(
-                    rotation=whole.pose.rotation, translation=whole.pose.translation, parts=whole.parts
-                )
+        if whole is not None:
+            self._in_parts[number] = found.model, whole
+            found = found._replace(rotation=whole.pose.rotation, translation=whole.pose.translation)
         seen = found.evidence
         return Detection(
             id=number, model=self.models[found.model].name, scene_from_model=self._pose(found), score=found.score,
             support=seen.support(), visible_support=seen.visible_support(), penalty=seen.penalty(),
             coverage=seen.support(), rms_m=seen.rms, unobservable=self._unobservable(found),
-            parts=found.parts,
+            parts=whole.parts if whole else (),
         )  # fmt: skip
+
+    def built(self) -> dict[int, Floats]:
+        """By detection, where it was fitted in parts: its faces (F, 3, 3) as built, scan frame, metres."""
+        offset = self.scene.fine.cells.offset
+        return {k: self._assemblies.faces(*of) + offset for k, of in self._in_parts.items()}
+
+    def measured(self, found: Detection, reach: float) -> Detection:
+        """A detection with its raw points, its parts fitted to these; reach : of them from the surface, metres."""
+        if found.id not in self._in_parts or found.isolated is None:
+            return found
+        model, whole = self._in_parts[found.id]
+        offset = self.scene.fine.cells.offset
+        whole = self._assemblies.measured(model, whole, found.isolated.xyz - offset, reach)
+        pose = Pose(whole.pose.rotation, whole.pose.translation + offset)
+        return replace(found, scene_from_model=pose, parts=whole.parts)
 
     def _pose(self, found: Candidate) -> Pose:
         return Pose(found.rotation, found.translation + self.scene.fine.cells.offset)

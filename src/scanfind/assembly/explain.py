@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from scanfind.assembly.fit import PartsFit, PlacedParts, View, rotation_vector, skew
 from scanfind.assembly.parts import Assembly, assembly_of
+from scanfind.assembly.points import fitted_to_points, placed_faces
 from scanfind.detection import PartFit
 from scanfind.pose import Pose, nearest_rotation, rotation_from_vector
 from scanfind.refine import triple, unobservable
@@ -45,12 +46,16 @@ class Explained(NamedTuple):
     pose : scene_from_model of the parts that keep to the design, relative to the grid's offset
     parts : one each; evidence : of all, but for missing ones that may be missing
     reason : why it is not believed, in words; empty where it is
+    placed, seen, parents : what the parts were told from: poses, evidence, and on which part each hangs
     """
 
     pose: Pose
     parts: tuple[PartFit, ...]
     evidence: Evidence
     reason: str
+    placed: PlacedParts
+    seen: Sequence[Evidence]
+    parents: NDArray[np.int64]
 
 
 class Assemblies:
@@ -67,6 +72,20 @@ class Assemblies:
         fit = self._fits[model]
         return None if fit is None else explained(fit, pose, self._blind)
 
+    def faces(self, model: int, whole: Explained) -> Floats:
+        """The faces (F, 3, 3) of a model as built, relative to the grid's offset; without its missing parts."""
+        fit, mesh = self._fits[model], self._models[model].mesh
+        assert fit is not None and mesh is not None  # else nothing could have been explained
+        return placed_faces(mesh, fit.assembly, whole.placed, [part.status != MISSING for part in whole.parts])
+
+    def measured(self, model: int, whole: Explained, points: Floats, reach: float) -> Explained:
+        """The same, each part fitted to the raw points (N, 3) within `reach` of it, relative to the grid's offset."""
+        fit, mesh = self._fits[model], self._models[model].mesh
+        assert fit is not None and mesh is not None
+        placed = fitted_to_points(whole.placed, mesh, fit.assembly, points, reach)
+        pose, parts, _ = told(placed, whole.seen, whole.parents, fit.assembly, whole.pose)
+        return whole._replace(pose=pose, parts=parts, placed=placed)
+
     def _cut(self, model: Model) -> PartsFit | None:
         if model.mesh is None:
             return None
@@ -79,18 +98,26 @@ def explained(fit: PartsFit, pose: Pose, blind: bool) -> Explained:
     """What the scan says of a model placed near `pose`, in parts; blind : no scanner position is known."""
     parts, seen, parents = fit.fit(pose)
     assembly, parameters, verify = fit.assembly, fit.parameters, fit.view.verify
-    status = [status_of(one) for one in seen]
-    reference, keeps = consensus(parts, seen, status, assembly, pose)
-    told = tuple(
-        told_of(k, parts, seen[k], status[k], int(parents[k]), reference, assembly) for k in range(len(seen))
-    )  # fmt: skip
-    all_seen, kept = sum(one.supported for one in seen), sum(one.supported for one, on in zip(seen, keeps, strict=True) if on)
-    spared = forgiven(assembly, status, seen, parameters.most_missing)
+    reference, fits, kept = told(parts, seen, parents, assembly, pose)
+    spared = forgiven(assembly, [part.status for part in fits], seen, parameters.most_missing)
     evidence = together([one for one, spare in zip(seen, spared, strict=True) if not spare])
     reason = why_refused(evidence, blind, verify)
-    if not reason and kept < parameters.least_kept * all_seen:
-        reason = f"only {kept / all_seen:.0%} of what is seen of it keeps to the design, {parameters.least_kept:.0%} is asked for"
-    return Explained(reference, told, evidence, reason)
+    if not reason and kept < parameters.least_kept:
+        reason = f"only {kept:.0%} of what is seen of it keeps to the design, {parameters.least_kept:.0%} is asked for"
+    return Explained(reference, fits, evidence, reason, parts, seen, parents)
+
+
+def told(
+    parts: PlacedParts, seen: Sequence[Evidence], parents: NDArray[np.int64], assembly: Assembly, pose: Pose
+) -> tuple[Pose, tuple[PartFit, ...], float]:  # fmt: skip
+    """The pose of the design, the parts against it, and the share of the surface seen that keeps to it."""
+    status = [status_of(one) for one in seen]
+    reference, keeps = consensus(parts, seen, status, assembly, pose)
+    fits = tuple(
+        told_of(k, parts, seen[k], status[k], int(parents[k]), reference, assembly) for k in range(len(seen))
+    )  # fmt: skip
+    supported = np.array([one.supported for one in seen])
+    return reference, fits, float(supported[keeps].sum() / max(supported.sum(), 1))
 
 
 def status_of(seen: Evidence) -> str:

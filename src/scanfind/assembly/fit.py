@@ -8,6 +8,7 @@ outweighs them a thousandfold: they hold what the scan leaves open, and nothing 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from scanfind.assembly.parameters import AssemblyParameters
     from scanfind.assembly.parts import Assembly, Joint
     from scanfind.scene import Scene
+    from scanfind.search import ModelArrays
     from scanfind.verify import VerifyParameters
 
 Floats = NDArray[np.float64]
@@ -207,12 +209,9 @@ class PartsFit:
 
     def _together(self, parts: PlacedParts) -> PlacedParts:
         """Fit all parts at once, each tied to where its neighbours are at the step before."""
-        joints = [tied for joint in self.assembly.joints for tied in ((joint.a, joint.b), (joint.b, joint.a))]
-        of, others = np.array(joints, np.int64).reshape(-1, 2).T
-        places = np.repeat(np.array([joint.place for joint in self.assembly.joints]).reshape(-1, 3), 2, axis=0)
         fine = self.view.fine
         for gate in np.geomspace(1.0, LAST_CELLS, STEPS) * fine.surfels.cell:
-            hinges = Hinges(of, places, parts.rotations[others], parts.translations[others])
+            hinges = hinges_of(self.assembly.joints, parts)
             parts = self._step(parts, fine, max(gate, 3.0 * self.view.scene.noise), hinges)
         return parts
 
@@ -235,37 +234,60 @@ class PartsFit:
             hypotheses(parts), self._unseeing, level._replace(inlier=gate), sizes, arrays, self.view.signed, rules,
             self.view.jobs,
         )  # fmt: skip
-        tied, pull = springs(parts, hinges, arrays.centres, arrays.radii)
-        rotations, translations = parts.rotations.copy(), parts.translations.copy()
-        information, noise, share = np.zeros_like(parts.information), parts.noise.copy(), parts.share.copy()
-        ends = np.cumsum(sizes)
-        for h, (number, end) in enumerate(zip(parts.numbers, ends, strict=True)):
+        found = []
+        for h, (number, end) in enumerate(zip(parts.numbers, np.cumsum(sizes), strict=True)):
             claim = claims[end - sizes[h] : end]
             on = np.flatnonzero(claim >= 0)
-            base, centre, radius = arrays.starts[number], arrays.centres[number], arrays.radii[number]
-            rotation = rotations[h]
-            middle = rotation @ centre + translations[h]
-            rows, gap, weight = matches(
-                arrays.points[base + on] @ rotation.T + translations[h], arrays.normals[base + on] @ rotation.T,
-                surfels.means[claim[on]], surfels.normals[claim[on]], middle, radius, gate,
-            )  # fmt: skip
-            information[h] = (rows * weight[:, None]).T @ rows
-            total = float(weight.sum())
-            noise[h] = max(LEAST_NOISE_M, np.sqrt((weight * gap * gap).sum() / total)) if total > 0.0 else gate
-            share[h] = len(np.unique(claim[on])) / len(on) if len(on) else 1.0
-            precision = share[h] / noise[h] ** 2
-            # A thousandth of one match in a thousand, as in ICP of whole poses: a part that hangs on nothing stays.
-            hessian = precision * information[h] + tied[h] + 1e-6 * (precision * total + 1.0) * np.eye(6)
-            step = np.linalg.solve(hessian, precision * (rows.T @ (weight * gap)) + pull[h])
-            rotations[h] = nearest_rotation(rotation_from_vector(step[:3] / radius) @ rotation)
-            translations[h] = middle + step[3:] - rotations[h] @ centre
-        return PlacedParts(parts.numbers, rotations, translations, information, noise, share)
+            base, pose = arrays.starts[number], parts.pose(h)
+            points, normals = pose.move(arrays.points[base + on]), pose.turn(arrays.normals[base + on])
+            surfel = claim[on]
+            gaps, weights = matches(points, normals, surfels.means[surfel], surfels.normals[surfel], gate)
+            share = len(np.unique(surfel)) / len(on) if len(on) else 1.0
+            found.append(Matches(points, normals, gaps, weights, share))
+        return stepped(parts, found, hinges, arrays)
+
+
+class Matches(NamedTuple):
+    """Where a part meets the scan: N points of it and their normals (N, 3), scene frame.
+
+    gaps : (N,) metres the scan lies above each, along its normal; weights : (N,) 0 … 1
+    share : of them that count as independent
+    """
+
+    points: Floats
+    normals: Floats
+    gaps: Floats
+    weights: Floats
+    share: float
+
+
+def stepped(parts: PlacedParts, found: list[Matches], hinges: Hinges, arrays: ModelArrays) -> PlacedParts:
+    """The parts after one Gauss-Newton step towards what each of them meets, held by the hinges."""
+    tied, pull = springs(parts, hinges, arrays.centres, arrays.radii)
+    rotations, translations = parts.rotations.copy(), parts.translations.copy()
+    information, noise, share = np.zeros_like(parts.information), parts.noise.copy(), parts.share.copy()
+    for h, (number, met) in enumerate(zip(parts.numbers, found, strict=True)):
+        centre, radius = arrays.centres[number], arrays.radii[number]
+        middle = rotations[h] @ centre + translations[h]
+        rows = np.hstack([np.cross(met.points - middle, met.normals) / radius, met.normals])
+        information[h] = (rows * met.weights[:, None]).T @ rows
+        total = float(met.weights.sum())
+        squares = float((met.weights * met.gaps * met.gaps).sum())
+        noise[h] = max(LEAST_NOISE_M, np.sqrt(squares / total)) if total > 0.0 else 1.0
+        share[h] = met.share
+        precision = share[h] / noise[h] ** 2
+        # A thousandth of one match in a thousand, as in ICP of whole poses: a part that hangs on nothing stays.
+        hessian = precision * information[h] + tied[h] + 1e-6 * (precision * total + 1.0) * np.eye(6)
+        step = np.linalg.solve(hessian, precision * (rows.T @ (met.weights * met.gaps)) + pull[h])
+        rotations[h] = nearest_rotation(rotation_from_vector(step[:3] / radius) @ rotations[h])
+        translations[h] = middle + step[3:] - rotations[h] @ centre
+    return PlacedParts(parts.numbers, rotations, translations, information, noise, share)
 
 
 def matches(
-    points: Floats, normals: Floats, means: Floats, directions: Floats, middle: Floats, radius: float, gate: float
-) -> tuple[Floats, Floats, Floats]:
-    """Of N placed samples and the surfels they meet: rows (N, 6) of the motions, gaps (N,), Tukey's weights (N,).
+    points: Floats, normals: Floats, means: Floats, directions: Floats, gate: float
+) -> tuple[Floats, Floats]:  # fmt: skip
+    """Of N placed samples and the surfels they meet: gaps (N,), and Tukey's weights (N,).
 
     The gap is measured along the mean of both normals: of a bent surface a sample beside its surfel lies as far
     beneath the one's plane as above the other's (Rusinkiewicz 2019).
@@ -273,9 +295,22 @@ def matches(
     sides = np.where((normals * directions).sum(axis=1) < 0.0, -1.0, 1.0)
     between = normals + sides[:, None] * directions
     between /= np.maximum(np.linalg.norm(between, axis=1), 1e-12)[:, None]
-    gap = ((means - points) * between).sum(axis=1)
-    weight = np.maximum(1.0 - (gap / gate) ** 2, 0.0) ** 2
-    return np.hstack([np.cross(points - middle, normals) / radius, normals]), gap, weight
+    gaps = ((means - points) * between).sum(axis=1)
+    return gaps, tukey(gaps, gate)
+
+
+def tukey(gaps: Floats, gate: float) -> Floats:
+    """Tukey's weights, 0 from the gate on."""
+    weights: Floats = np.maximum(1.0 - (gaps / gate) ** 2, 0.0) ** 2
+    return weights
+
+
+def hinges_of(joints: Sequence[Joint], parts: PlacedParts) -> Hinges:
+    """Every part of an assembly, in their order, tied to where its neighbours are."""
+    pairs = [tied for joint in joints for tied in ((joint.a, joint.b), (joint.b, joint.a))]
+    of, others = np.array(pairs, np.int64).reshape(-1, 2).T
+    places = np.repeat(np.array([joint.place for joint in joints]).reshape(-1, 3), 2, axis=0)
+    return Hinges(of, places, parts.rotations[others], parts.translations[others])
 
 
 def springs(parts: PlacedParts, hinges: Hinges, centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
