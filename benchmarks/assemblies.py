@@ -145,7 +145,7 @@ def scene_row(seed: int, kind: str, points: int, *, rigid: bool) -> Row:
         measured=int(mm <= MEASURED_MM and deg <= MEASURED_DEG), error_mm=mm, error_deg=deg,
         sigma_mm=1e3 * part.shift_sigma_m if part is not None else NAN,
         sigma_deg=float(np.degrees(part.turn_sigma_rad)) if part is not None else NAN,
-        others_off=sum(one.off_m > OFF_M for one in others), missing=sum(one.status == "missing" for one in others),
+        others_off=sum(one.is_off(OFF_M) for one in others), missing=sum(one.status == "missing" for one in others),
         total_s=found.timings_s["total"], note="" if right or not found.refused else found.refused[0].reason,
     )  # fmt: skip
 

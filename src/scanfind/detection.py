@@ -46,11 +46,11 @@ class PartFit:
     joined_to : the part it hangs on; None for the one all others hang on
     built_from_design : what moves the part's design to where it was built, but for what the data do not fix
     shift_m : (3,) of the part's middle; turn_rad : axis × angle (3,)
-    off_m : how far the point of the part's surface that moved the most did
+    off_m, off_sigma_m : how far the point of the part's surface that moved the most did; its standard deviation
     shift_sigma_m, turn_sigma_rad : one standard deviation in the worst direction of those the data fix
     free : motions of the part the data do not fix: shift and turn hold none of them
     support, visible_support, penalty : as of a detection, of the part's surface alone
-    Not measured: no motion, and NaN for off_m and both deviations.
+    Not measured: no motion, and NaN for off_m and all deviations.
     """
 
     name: str
@@ -60,12 +60,17 @@ class PartFit:
     shift_m: tuple[float, float, float]
     turn_rad: tuple[float, float, float]
     off_m: float
+    off_sigma_m: float
     shift_sigma_m: float
     turn_sigma_rad: float
     free: tuple[Motion, ...]
     support: float
     visible_support: float
     penalty: float
+
+    def is_off(self, tolerance_m: float = 0.003) -> bool:
+        """Is some of it surely farther from the design than a tolerance: by that and by three standard deviations?"""
+        return self.off_m > max(tolerance_m, 3.0 * self.off_sigma_m)
 
 
 @dataclass(frozen=True, eq=False)

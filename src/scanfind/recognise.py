@@ -96,7 +96,7 @@ class Recognition:
         self._apart_before, self._apart_after = diameters / 30.0, diameters / 100.0
         self._drawn_in = diameters / 10.0
         self._similar: dict[int, list[Pose]] = {}
-        view = View(scene, self._fine, self._thin, self.signed, parameters.verify, jobs)
+        view = View(scene, self._fine, self._thin, self.signed, parameters.verify)
         self._assemblies = Assemblies(models, view, parameters.assembly, self.blind)
         self._tried_in_parts: list[Candidate] = []
         self._in_parts: dict[int, tuple[int, Explained]] = {}
@@ -347,7 +347,7 @@ class Recognition:
     def _detection(self, number: int, found: Candidate) -> Detection:
         whole = found.whole
         if self.parameters.assembly.parts and whole is None:
-            whole = self._assemblies.explain(found.model, Pose(found.rotation, found.translation))
+            whole = self._assemblies.explain(found.model, Pose(found.rotation, found.translation), believed=True)
         if whole is not None:
             self._in_parts[number] = found.model, whole
             found = found._replace(rotation=whole.pose.rotation, translation=whole.pose.translation)

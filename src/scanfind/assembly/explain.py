@@ -33,9 +33,9 @@ LEAST_SUPPORTED, LEAST_SHOWN = 20, 0.08
 THERE = 0.5  # share of what scanners could see of a part that must be there for it to be there
 # Parts whose surface lies within this of where the design puts it, rms, keep to it: as a scan's noise is.
 KEEPS_M = 0.002
-# A motion the data hold less than this share of the mean is free. The model's normals are exact, so what is free here
-# is so by shape: a cylinder's facets hold its roll by 1e-5, the face of a flange its slide by 0.05.
-FREE_BELOW = 0.004
+# A motion the data hold less than this share of the mean is free: facets hold the roll of a cylinder by 0.003, and the
+# oblique ones around a branch its slide by 0.013; the face of a flange holds the slide of a leg of 1 m by 0.15.
+FREE_BELOW = 0.02
 # Surfels near each other err alike (bent surface, mixed pixels), which their residuals do not show.
 ALIKE_M, ALIKE_SHARE = 1e-4, 3.0
 
@@ -65,12 +65,15 @@ class Assemblies:
         self._models, self._view, self._parameters, self._blind = models, view, parameters, blind
         self._fits: dict[int, PartsFit | None] = {}
 
-    def explain(self, model: int, pose: Pose) -> Explained | None:
-        """Fit the parts of a model placed near `pose`; None where it has but one."""
+    def explain(self, model: int, pose: Pose, *, believed: bool = False) -> Explained | None:
+        """Fit the parts of a model placed near `pose`; None where it has but one, or where that is hopeless.
+
+        believed : the pose is, without its parts: nothing is hopeless
+        """
         if model not in self._fits:
             self._fits[model] = self._cut(self._models[model])
         fit = self._fits[model]
-        return None if fit is None else explained(fit, pose, self._blind)
+        return None if fit is None else explained(fit, pose, self._blind, believed=believed)
 
     def faces(self, model: int, whole: Explained) -> Floats:
         """The faces (F, 3, 3) of a model as built, relative to the grid's offset; without its missing parts."""
@@ -94,9 +97,12 @@ class Assemblies:
         return None if assembly is None else PartsFit(assembly, self._view, self._parameters)
 
 
-def explained(fit: PartsFit, pose: Pose, blind: bool) -> Explained:
+def explained(fit: PartsFit, pose: Pose, blind: bool, *, believed: bool) -> Explained | None:
     """What the scan says of a model placed near `pose`, in parts; blind : no scanner position is known."""
-    parts, seen, parents = fit.fit(pose)
+    fitted = fit.fit(pose, believed=believed)
+    if fitted is None:
+        return None
+    parts, seen, parents = fitted
     assembly, parameters, verify = fit.assembly, fit.parameters, fit.view.verify
     reference, fits, kept = told(parts, seen, parents, assembly, pose)
     spared = forgiven(assembly, [part.status for part in fits], seen, parameters.most_missing)
@@ -191,7 +197,7 @@ def told_of(
     if status != MEASURED:
         none = (0.0, 0.0, 0.0)
         nan = float("nan")
-        return PartFit(assembly.names[k], status, joined_to, Pose.identity(), none, none, nan, nan, nan, (), *shares)
+        return PartFit(assembly.names[k], status, joined_to, Pose.identity(), none, none, nan, nan, nan, nan, (), *shares)
     centre, radius = assembly.arrays.centres[k], float(assembly.arrays.radii[k])
     turned = np.kron(np.eye(2), reference.rotation)
     information = turned.T @ parts.information[k] @ turned
@@ -207,9 +213,13 @@ def told_of(
     rotation = rotation_from_vector(turn)
     built_from_design = Pose(rotation, centre + shift - rotation @ centre)
     points = assembly.points(k)
+    moved = built_from_design.move(points) - points
+    farthest = int(np.argmax(np.linalg.norm(moved, axis=1)))
+    lever = np.hstack([-skew(points[farthest] - centre) / radius, np.eye(3)])
+    off, off_sigma = np.linalg.norm(moved[farthest]), np.sqrt(np.linalg.eigvalsh(lever @ covariance @ lever.T)[-1])
     return PartFit(
         assembly.names[k], status, joined_to, built_from_design, triple(shift), triple(turn),
-        float(np.linalg.norm(built_from_design.move(points) - points, axis=1).max()), sigma_shift, sigma_turn,
+        float(off), float(off_sigma), sigma_shift, sigma_turn,
         unobservable(information, centre, radius, FREE_BELOW), *shares,
     )  # fmt: skip
 

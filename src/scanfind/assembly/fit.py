@@ -31,18 +31,20 @@ Floats = NDArray[np.float64]
 # The springs of a joint: a gap and a turn this large cost as much as one standard deviation of the data does.
 SPRING_M, SPRING_RAD = 0.02, np.radians(3.0)
 LEAST_NOISE_M = 5e-4  # of a surfel: a scan that fits better still does not bind a part more
-# From as far as parts may be off to as near as surfels tell; in all 14 steps, of which four suffice for most parts.
-STEPS, LAST_CELLS = 10, 0.5
+# From as far as parts may be off to as near as surfels tell, each part by itself; then all together.
+WIDE_STEPS, FINE_STEPS, STEPS, LAST_CELLS = 6, 4, 10, 0.5
+WIDE_SAMPLES = 200  # of a part, while it is looked for within centimetres
 NORMALS_AGREE = 0.7  # as in the refinement of whole poses
 # A part that most of its looked-at surface supports where its neighbour has it is where it should be.
 SETTLED = 0.95
+ONE_THREAD = 1  # a step takes a millisecond, as the start of a thread does
 
 
 class View(NamedTuple):
     """The scene as parts are held against it.
 
     fine, thin : as whole poses are (see verify.gather); thin, which is coarser, for steps of several centimetres too
-    signed : both sides know which way their normals face; jobs : threads
+    signed : both sides know which way their normals face
     """
 
     scene: Scene
@@ -50,7 +52,6 @@ class View(NamedTuple):
     thin: Level
     signed: bool
     verify: VerifyParameters
-    jobs: int
 
 
 class Hinges(NamedTuple):
@@ -97,11 +98,12 @@ class PartsFit:
         # Correspondences need no depth maps: without them the kernel asks no beams.
         self._unseeing = replace(view.scene, depths=[])
 
-    def fit(self, pose: Pose) -> tuple[PlacedParts, list[Evidence], NDArray[np.int64]]:
+    def fit(self, pose: Pose, *, believed: bool) -> tuple[PlacedParts, list[Evidence], NDArray[np.int64]] | None:
         """The parts of a model placed at `pose` where the scan has them; what it says of each; their parents, (P,).
 
         From the part with the most evidence outwards: each begins where the one before it would have it, and where
-        that explains it badly, it is also tried bent and slid about the joint. Then all are fitted together.
+        that explains it badly, it is also tried bent and slid about the joint. Then all are fitted together. None as
+        soon as so much was seen through that no fit of the rest can help, unless the pose is `believed` already.
         """
         self._reach(pose)
         count = len(self.assembly.names)
@@ -109,18 +111,20 @@ class PartsFit:
         seen = self.evidence(start)
         root = int(np.argmax([one.supported for one in seen]))
         order, parents, places = self._tree(root)
-        poses = [pose] * count
+        poses, tally = [pose] * count, np.array([self._sizes.sum(), 0])
         for part in order:
             before = poses[parents[part]] if parents[part] >= 0 else pose
-            poses[part] = self._one(part, before, places[part])
+            poses[part], found = self._one(part, before, places[part])
+            tally += [found.supported - found.samples, found.seen_through]
+            if not believed and self._hopeless(*tally):
+                return None
         together = self._together(placed(np.arange(count), poses))
         return together, self.evidence(together), parents
 
     def evidence(self, parts: PlacedParts) -> list[Evidence]:
         """What the scene says of each placed part."""
         at, view = hypotheses(parts), self.view
-        arrays, jobs = self.assembly.arrays, view.jobs
-        return gather(at, view.scene, view.fine, view.thin, arrays, view.signed, view.verify, jobs)
+        return gather(at, view.scene, view.fine, view.thin, self.assembly.arrays, view.signed, view.verify, ONE_THREAD)
 
     def _reach(self, pose: Pose) -> None:
         """Fit the surfels as far around a pose as its parts may be off."""
@@ -154,18 +158,25 @@ class PartsFit:
             left.remove(part)
         return order, parents, places
 
-    def _one(self, part: int, before: Pose, place: Floats) -> Pose:
+    def _hopeless(self, supported: int, through: int) -> bool:
+        """Would the score be too low with at most so many samples supported and at least so many seen through?"""
+        verify = self.view.verify
+        spared = self.parameters.most_missing * float(self._sizes.sum())
+        against = verify.penalty_weight * max(through - spared, 0.0)
+        return supported < verify.min_score * (supported + against)
+
+    def _one(self, part: int, before: Pose, place: Floats) -> tuple[Pose, Evidence]:
         """Where a part is that its neighbour would have at `before`, scene_from_model, joined at `place` (3,)."""
         first = self._settle(placed(np.array([part]), [before]), before, place)
         seen = self.evidence(first)[0]
         enough = self.view.verify.min_support * seen.samples
         if seen.supported >= enough and seen.visible_support() >= SETTLED and self._near(first.pose(0), before, place):
-            return first.pose(0)
+            return first.pose(0), seen
         moves = self._trials(part, place)
         tried = self._settle(placed(np.full(len(moves), part), [before @ move for move in moves]), before, place)
         tried = PlacedParts(*(np.concatenate(pair) for pair in zip(first, tried, strict=True)))
         weight = self.view.verify.penalty_weight
-        best, most = before, -np.inf
+        best, most, told = before, -np.inf, None
         for k, found in enumerate(self.evidence(tried)):
             if not self._near(tried.pose(k), before, place):
                 continue
@@ -174,8 +185,8 @@ class PartsFit:
             strain = gap / self.parameters.most_shift_m + np.degrees(turn) / self.parameters.most_turn_deg
             value = found.supported - weight * found.seen_through - 0.05 * strain * found.samples
             if value > most:
-                best, most = tried.pose(k), value
-        return best
+                best, most, told = tried.pose(k), value, found
+        return best, told or self.evidence(placed(np.array([part]), [before]))[0]
 
     def _trials(self, part: int, place: Floats) -> list[Pose]:
         """Motions of a part, model frame, about a joint: bent either way about two axes, slid along three."""
@@ -220,19 +231,20 @@ class PartsFit:
         coarse, fine = self.view.thin, self.view.fine
         far = min(0.75 * self.parameters.most_shift_m, 4.0 * coarse.surfels.cell)
         near = min(1.2 * fine.surfels.cell, far)
-        wide = [(coarse, float(gate)) for gate in np.geomspace(far, near, STEPS)]
-        return wide + [(fine, float(gate)) for gate in np.geomspace(near, 0.6 * near, STEPS // 2)]
+        coarse = coarse._replace(samples=WIDE_SAMPLES)
+        wide = [(coarse, float(gate)) for gate in np.geomspace(far, near, WIDE_STEPS)]
+        return wide + [(fine, float(gate)) for gate in np.geomspace(near, 0.6 * near, FINE_STEPS)]
 
     def _step(self, parts: PlacedParts, level: Level, gate: float, hinges: Hinges) -> PlacedParts:
         """One Gauss-Newton step of each part."""
         surfels, arrays = level.surfels, self.assembly.arrays
-        sizes = self._sizes[parts.numbers]
+        sizes = np.minimum(self._sizes[parts.numbers], level.samples)
         rules = replace(
             self.view.verify, gate_cells=min(4.0, gate / surfels.cell), normal_agreement=NORMALS_AGREE
         )
         _, _, claims = held_against(
             hypotheses(parts), self._unseeing, level._replace(inlier=gate), sizes, arrays, self.view.signed, rules,
-            self.view.jobs,
+            ONE_THREAD,
         )  # fmt: skip
         found = []
         for h, (number, end) in enumerate(zip(parts.numbers, np.cumsum(sizes), strict=True)):
