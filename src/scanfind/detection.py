@@ -13,6 +13,10 @@ from scanfind.pose import Pose
 
 Floats = NDArray[np.float64]
 
+# Off the design from here on: the usual tolerance of a pipe spool's dimensions (ASME B31.3, Pipe Fabrication
+# Institute ES-3: 3 mm).
+OFF_M = 0.003
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -68,7 +72,7 @@ class PartFit:
     visible_support: float
     penalty: float
 
-    def is_off(self, tolerance_m: float = 0.003) -> bool:
+    def is_off(self, tolerance_m: float = OFF_M) -> bool:
         """Is some of it surely farther from the design than a tolerance: by that and by three standard deviations?"""
         return self.off_m > max(tolerance_m, 3.0 * self.off_sigma_m)
 

@@ -15,7 +15,7 @@ from pydantic_core import to_jsonable_python
 
 from scanfind import schema
 from scanfind.clock import STAGES
-from scanfind.detection import Detection, Deviation, Findings, Motion, Refused, SceneScan
+from scanfind.detection import Detection, Deviation, Findings, Motion, PartFit, Refused, SceneScan
 from scanfind.pose import Pose
 
 if TYPE_CHECKING:
@@ -131,11 +131,36 @@ def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -
         penalty=_or_none(found.penalty),
         coverage=_or_none(found.coverage),
         rms_m=_or_none(found.rms_m),
-        unobservable=[schema.MotionEntry(kind=m.kind, axis=m.axis, through_m=m.through) for m in found.unobservable],
+        unobservable=[_motion_entry(motion) for motion in found.unobservable],
         points=0 if found.isolated is None else len(found.isolated),
         isolated=isolated,
         pose=pose,
         deviation=None if deviation is None else _deviation_entry(deviation),
+        parts=[_part_entry(part) for part in found.parts],
+    )
+
+
+def _motion_entry(motion: Motion) -> schema.MotionEntry:
+    return schema.MotionEntry(kind=motion.kind, axis=motion.axis, through_m=motion.through)
+
+
+def _part_entry(part: PartFit) -> schema.PartEntry:
+    measured = isfinite(part.off_m)
+    return schema.PartEntry(
+        name=part.name,
+        status=part.status,
+        joined_to=part.joined_to,
+        built_from_design=_rows(part.built_from_design) if measured else None,
+        shift_m=part.shift_m if measured else None,
+        turn_rad=part.turn_rad if measured else None,
+        off_m=_or_none(part.off_m),
+        off_sigma_m=_or_none(part.off_sigma_m),
+        shift_sigma_m=_or_none(part.shift_sigma_m),
+        turn_sigma_rad=_or_none(part.turn_sigma_rad),
+        free=[_motion_entry(motion) for motion in part.free],
+        support=_or_none(part.support),
+        visible_support=_or_none(part.visible_support),
+        penalty=_or_none(part.penalty),
     )
 
 
@@ -187,8 +212,33 @@ def _detection(entry: schema.DetectionEntry) -> Detection:
         penalty=_or_nan(entry.penalty),
         coverage=_or_nan(entry.coverage),
         rms_m=_or_nan(entry.rms_m),
-        unobservable=tuple(Motion(m.kind, m.axis, m.through_m) for m in entry.unobservable),
+        unobservable=_motions(entry.unobservable),
         deviation=None if deviation is None else Deviation(*map(_or_nan, deviation.model_dump().values())),
+        parts=tuple(_part(part) for part in entry.parts),
+    )
+
+
+def _motions(entries: Iterable[schema.MotionEntry]) -> tuple[Motion, ...]:
+    return tuple(Motion(entry.kind, entry.axis, entry.through_m) for entry in entries)
+
+
+def _part(entry: schema.PartEntry) -> PartFit:
+    still = (0.0, 0.0, 0.0)
+    return PartFit(
+        name=entry.name,
+        status=entry.status,
+        joined_to=entry.joined_to,
+        built_from_design=Pose.identity() if entry.built_from_design is None else _pose(entry.built_from_design),
+        shift_m=entry.shift_m or still,
+        turn_rad=entry.turn_rad or still,
+        off_m=_or_nan(entry.off_m),
+        off_sigma_m=_or_nan(entry.off_sigma_m),
+        shift_sigma_m=_or_nan(entry.shift_sigma_m),
+        turn_sigma_rad=_or_nan(entry.turn_sigma_rad),
+        free=_motions(entry.free),
+        support=_or_nan(entry.support),
+        visible_support=_or_nan(entry.visible_support),
+        penalty=_or_nan(entry.penalty),
     )
 
 

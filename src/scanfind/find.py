@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scanfind.assembly import REACH_M
 from scanfind.clock import Clock, say_if_compiling, watched
 from scanfind.cloud import CloudModel, PointChunk, shift_for
 from scanfind.detection import Findings
@@ -23,6 +24,7 @@ from scanfind.model import Model, ModelParameters
 from scanfind.moments import MomentGrid
 from scanfind.near_surface import near_model, near_triangles
 from scanfind.parameters import PRESETS, IsolationParameters, Parameters
+from scanfind.pose import Pose
 from scanfind.recognise import Recognition
 from scanfind.scene import build_scene, first_cell
 from scanfind.sources import Scan, Sources, require_points
@@ -30,8 +32,6 @@ from scanfind.threads import available_cores
 
 if TYPE_CHECKING:
     from scanfind.detection import Detection
-    from scanfind.kernels.distance import NearSurface
-    from scanfind.pose import Pose
     from scanfind.progress import Progress
     from scanfind.scans import CloudWriter
 
@@ -104,13 +104,16 @@ def find(
 
     findings.extend(found.detections())
     findings.refused = found.refused()
+    if isolate and (built := found.built()):
+        with clock("isolate"):  # each part by its own raw points, in a pass of its own: where they are decides 3.5
+            around = near_parts(built, watched(sources.chunks(), clock, tell, "isolate", sources.expected()), jobs)
+            findings[:] = [found.measured(one, around.get(one.id)) for one in findings]
     if isolate and (findings or remainder is not None):
         with clock("isolate"):  # 3.5 isolation: the second pass
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
             tolerance = isolation_tolerance(parameters.isolate, found.noise(), scene.fine.cell)
             findings.tolerance_m = tolerance
-            isolated = with_points(findings, library, found.built(), chunks, tolerance, remainder, jobs)
-            findings[:] = [found.measured(one, tolerance) for one in isolated]  # each part by its own points
+            findings[:] = with_points(findings, library, found.built(), chunks, tolerance, remainder, jobs)
     findings.scans = [source.told() for source in sources.all]
     findings.crs, findings.notes = sources.crs(), found.notes()
     findings.shift = tuple(shift_for(scene.fine.cells.offset).tolist())
@@ -181,7 +184,7 @@ def with_points(
         if any(found.model == model.name for found in findings)
     }
     placed = [
-        Placed(found.id, near_built(built[found.id], found.scene_from_model, tolerance), found.scene_from_model)
+        as_built(found.id, built[found.id], tolerance)
         if found.id in built
         else Placed(found.id, surfaces[found.model], found.scene_from_model)
         for found in findings
@@ -194,10 +197,18 @@ def with_points(
     ]
 
 
-def near_built(faces: Floats, scene_from_model: Pose, tolerance: float) -> NearSurface:
+def near_parts(built: Mapping[int, Floats], chunks: Iterable[PointChunk], jobs: int) -> dict[int, Floats]:
+    """The raw points (N, 3) around each detection as built, from which its parts are measured."""
+    placed = [as_built(number, faces, REACH_M) for number, faces in built.items()]
+    points = isolate_raw(chunks, placed, IsolateParameters(REACH_M), jobs=jobs)
+    return {number: cut.xyz for number, cut in points.items()}
+
+
+def as_built(number: int, faces: Floats, reach: float) -> Placed:
     """The surface of a detection as built; faces (F, 3, 3), scan frame."""
-    # In the model's frame: far from zero single precision would round the tree of boxes.
-    return near_triangles(scene_from_model.inverse().move(faces.reshape(-1, 3)).reshape(-1, 3, 3), tolerance)
+    # About a corner: far from zero single precision would round the tree of boxes.
+    corner = faces[0, 0]
+    return Placed(number, near_triangles(faces - corner, reach), Pose(np.eye(3), corner.copy()))
 
 
 def write_rest(writer: CloudWriter, chunk: PointChunk) -> None:

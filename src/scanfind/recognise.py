@@ -364,13 +364,14 @@ class Recognition:
         offset = self.scene.fine.cells.offset
         return {k: self._assemblies.faces(*of) + offset for k, of in self._in_parts.items()}
 
-    def measured(self, found: Detection, reach: float) -> Detection:
-        """A detection with its raw points, its parts fitted to these; reach : of them from the surface, metres."""
-        if found.id not in self._in_parts or found.isolated is None:
+    def measured(self, found: Detection, points: Floats | None) -> Detection:
+        """A detection with its parts fitted to raw points (N, 3) around it, scan frame; None: it has no parts."""
+        if points is None:
             return found
         model, whole = self._in_parts[found.id]
         offset = self.scene.fine.cells.offset
-        whole = self._assemblies.measured(model, whole, found.isolated.xyz - offset, reach)
+        whole = self._assemblies.measured(model, whole, points - offset)
+        self._in_parts[found.id] = model, whole
         pose = Pose(whole.pose.rotation, whole.pose.translation + offset)
         return replace(found, scene_from_model=pose, parts=whole.parts)
 

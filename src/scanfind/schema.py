@@ -71,8 +71,37 @@ class DeviationEntry(Entry):
     worst_m: float | None
 
 
+class PartEntry(Entry):
+    """One part of a found assembly, against the parts that keep to the design; model frame.
+
+    `status`: measured; missing: beams passed through most of it; not_seen: too little of it was looked at to say.
+    `joined_to`: the part it hangs on. `shift_m`, of its middle, and `turn_rad`, axis × angle, hold nothing of the motions
+    in `free`, which the scan does not fix; each sigma is one standard deviation in the worst of the other directions.
+    `off_m`: how far the point of its surface that moved the most did. All null where it was not measured.
+    """
+
+    name: str
+    status: str
+    joined_to: str | None
+    built_from_design: Matrix | None
+    shift_m: Vector | None
+    turn_rad: Vector | None
+    off_m: float | None
+    off_sigma_m: float | None
+    shift_sigma_m: float | None
+    turn_sigma_rad: float | None
+    free: list[MotionEntry]
+    support: float | None
+    visible_support: float | None
+    penalty: float | None
+
+
 class DetectionEntry(Entry):
-    """One instance of one model. `isolated` and `pose` are files of the result folder, null where none was written."""
+    """One instance of one model. `isolated` and `pose` are files of the result folder, null where none was written.
+
+    `parts` is empty where they were not asked for (`assembly.parts`, --parts) and where the model has but one. With parts,
+    `isolated` and `deviation` are of the parts where they were built.
+    """
 
     id: int
     model: str
@@ -90,6 +119,7 @@ class DetectionEntry(Entry):
     isolated: str | None
     pose: str | None
     deviation: DeviationEntry | None
+    parts: list[PartEntry] = []
 
 
 class RefusedEntry(Entry):

@@ -8,5 +8,6 @@ from scanfind.assembly.explain import Assemblies, Explained
 from scanfind.assembly.fit import View
 from scanfind.assembly.parameters import AssemblyParameters
 from scanfind.assembly.parts import Assembly, Joint, assembly_of
+from scanfind.assembly.points import REACH_M
 
-__all__ = ["Assemblies", "Assembly", "AssemblyParameters", "Explained", "Joint", "View", "assembly_of"]
+__all__ = ["REACH_M", "Assemblies", "Assembly", "AssemblyParameters", "Explained", "Joint", "View", "assembly_of"]

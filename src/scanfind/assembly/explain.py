@@ -81,11 +81,11 @@ class Assemblies:
         assert fit is not None and mesh is not None  # else nothing could have been explained
         return placed_faces(mesh, fit.assembly, whole.placed, [part.status != MISSING for part in whole.parts])
 
-    def measured(self, model: int, whole: Explained, points: Floats, reach: float) -> Explained:
-        """The same, each part fitted to the raw points (N, 3) within `reach` of it, relative to the grid's offset."""
+    def measured(self, model: int, whole: Explained, points: Floats) -> Explained:
+        """The same, each part fitted to the raw points (N, 3) within REACH_M of it, relative to the grid's offset."""
         fit, mesh = self._fits[model], self._models[model].mesh
         assert fit is not None and mesh is not None
-        placed = fitted_to_points(whole.placed, mesh, fit.assembly, points, reach)
+        placed = fitted_to_points(whole.placed, mesh, fit.assembly, points)
         pose, parts, _ = told(placed, whole.seen, whole.parents, fit.assembly, whole.pose)
         return whole._replace(pose=pose, parts=parts, placed=placed)
 

@@ -17,12 +17,16 @@ from scanfind.near_surface import near_triangles, signed_distances
 
 if TYPE_CHECKING:
     from scanfind.assembly.parts import Assembly
+    from scanfind.kernels.distance import NearSurface
     from scanfind.mesh import Mesh
+    from scanfind.pose import Pose
 
 Floats = NDArray[np.float64]
 
-STEPS = 8
-# Of the spread of a part's points about it: farther ones are mixed pixels, or something else.
+# How far from the surface points are read: where all but a flange lies along a leg, surfels leave its slide 15 mm open.
+REACH_M = 0.025
+STEPS, SHRINK = 12, 0.7  # of the gate, from REACH_M down to …
+# … so many spreads of a part's points about it: farther ones are mixed pixels, or something else.
 GATE_SPREADS, SPREAD_OF_MEDIAN = 3.5, 1.4826
 LEAST_POINTS = 30
 MOST_POINTS = 20_000  # of a part: with 2 mm noise they tell 0.02 mm, less than any scanner is calibrated to
@@ -30,42 +34,38 @@ MOST_POINTS = 20_000  # of a part: with 2 mm noise they tell 0.02 mm, less than 
 APART_M = 0.005
 
 
-def fitted_to_points(parts: PlacedParts, mesh: Mesh, assembly: Assembly, points: Floats, reach: float) -> PlacedParts:
-    """The parts of one placed model, in their order, fitted to the raw points (N, 3) of it, the parts' frame.
-
-    reach : how far a point may be from the surface, metres
-    """
+def fitted_to_points(parts: PlacedParts, mesh: Mesh, assembly: Assembly, points: Floats) -> PlacedParts:
+    """The parts of one placed model, in their order, fitted to raw points (N, 3) within REACH_M, the parts' frame."""
     corners = mesh.triangles()
     own = [corners[assembly.part_of_face == k] for k in range(len(assembly.names))]
     # Points are told apart by the parts as they were placed by the surfels, within which they hardly move now.
-    surfaces = [near_triangles(faces, reach + APART_M) for faces in own]
+    surfaces = [near_triangles(faces, REACH_M + APART_M) for faces in own]
     far = np.stack([
         np.abs(signed_distances(surface, parts.pose(k).inverse().move(points))[0]) for k, surface in enumerate(surfaces)
     ])  # fmt: skip
     far = np.where(np.isnan(far), np.inf, far)
     nearest, two = np.argmin(far, axis=0), np.partition(far, 1, axis=0)[:2]
-    clear = (two[0] <= reach) & (two[1] >= two[0] + APART_M)
+    clear = (two[0] <= REACH_M) & (two[1] >= two[0] + APART_M)
     mine = [spread_out(np.flatnonzero(clear & (nearest == k))) for k in range(len(own))]
     normals = [face_normals(faces) for faces in own]
-    for _ in range(STEPS):
-        found = [
-            met(parts, k, surfaces[k], normals[k], points[mine[k]], reach) for k in range(len(own))
-        ]  # fmt: skip
+    for gate in REACH_M * SHRINK ** np.arange(STEPS):
+        found = [met(parts.pose(k), surfaces[k], normals[k], points[mine[k]], gate) for k in range(len(own))]
         parts = stepped(parts, found, hinges_of(assembly.joints, parts), assembly.arrays)
     return parts
 
 
-def met(
-    parts: PlacedParts, k: int, surface: object, normals: Floats, points: Floats, reach: float
-) -> Matches:  # fmt: skip
-    """Where a part meets its raw points (N, 3), scene frame; nowhere where these are too few."""
-    pose = parts.pose(k)
-    distance, face = signed_distances(surface, pose.inverse().move(points))  # type: ignore[arg-type]
+def met(pose: Pose, surface: NearSurface, normals: Floats, points: Floats, gate: float) -> Matches:
+    """Where a part meets its raw points (N, 3), scene frame; nowhere where these are too few.
+
+    normals : (F, 3) of its faces; gate : metres, widened to what the points are spread by
+    """
+    distance, face = signed_distances(surface, pose.inverse().move(points))
     on = np.flatnonzero(face >= 0)
     if len(on) < LEAST_POINTS:
         on = on[:0]
     gaps, normal = distance[on].astype(np.float64), pose.turn(normals[face[on]])
-    gate = min(reach, max(GATE_SPREADS * SPREAD_OF_MEDIAN * float(np.median(np.abs(gaps))), 1e-3)) if len(on) else reach
+    if len(on):
+        gate = min(max(gate, GATE_SPREADS * SPREAD_OF_MEDIAN * float(np.median(np.abs(gaps)))), REACH_M)
     return Matches(points[on] - gaps[:, None] * normal, normal, gaps, tukey(gaps, gate), 1.0)
 
 

@@ -38,6 +38,7 @@ def find(
     max_instances: Count | None = None,
     min_score: float | None = None,
     tolerance: Metres | None = None,
+    parts: Flag = False,
     time_limit: Seconds | None = None,
     fail_on: Literal["not-found"] | None = None,
 ) -> int:
@@ -87,6 +88,8 @@ def find(
         Refuse what scores less, 0 to 1.
     tolerance
         Points this near to a found model are its own, metres.
+    parts
+        Fit the parts of each model one by one: find what was not built to the drawing, and tell which part is off.
     time_limit
         Search no longer than this, seconds.
     fail_on
@@ -111,7 +114,7 @@ def find(
     flags = {
         "preset": preset, "seed": seed, "jobs": jobs, "units": units, "origin": origin, "format": format,
         "select": select, "search.max_instances": max_instances, "search.time_limit_s": time_limit,
-        "verify.min_score": min_score, "isolate.tolerance_m": tolerance,
+        "verify.min_score": min_score, "isolate.tolerance_m": tolerance, "assembly.parts": parts or None,
     }  # fmt: skip
     run, parameters = load_settings(PRESETS, flags, config)
     with ExitStack() as stack:
@@ -138,12 +141,14 @@ def find(
 
 def report(results: Results, out: Path | None, *, json: bool) -> None:
     """The table (or results.json) on stdout; on stderr where it lies and what was not found."""
-    from scanfind.cli.tables import closest, found_table
+    from scanfind.cli.tables import closest, found_table, parts_table
 
     if json:
         say(results.to_json())
     elif results.detections:
         say(found_table(results))
+        if off := parts_table(results):
+            say("\n" + off)
     for remark in [*results.notes, *closest(results)]:
         note(remark)
     points = sum(scan.points for scan in results.scans)

@@ -6,14 +6,18 @@ from collections.abc import Sequence
 from math import atan2, degrees, hypot
 from typing import TYPE_CHECKING
 
+from scanfind.detection import OFF_M
+
 if TYPE_CHECKING:
-    from scanfind.schema import DetectionEntry, Matrix, RefusedEntry, Results
+    from scanfind.schema import DetectionEntry, Matrix, PartEntry, RefusedEntry, Results
     from scanfind.simulate import Sight
 
 FOUND = (
     "id", "model", "x m", "y m", "z m", "yaw °", "pitch °", "roll °", "score", "visible %", "rms mm", "points",
     "mean mm", "95 % mm", "free to",
 )  # fmt: skip
+
+PARTS = ("id", "part", "status", "off mm", "± mm", "x mm", "y mm", "z mm", "turned °", "± °", "joined to", "free to")
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -31,6 +35,16 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def found_table(results: Results) -> str:
     """One line a detection; "mean" and "95 %" are of the signed, and of the absolute distances of its points."""
     return table(FOUND, [_found_row(found) for found in results.detections])
+
+
+def parts_table(results: Results) -> str:
+    """One line for each part of a detection that is surely off the design or missing; empty where none is.
+
+    x, y, z: the shift of its middle along the model's axes.
+    """
+    parts = [(found, part) for found in results.detections for part in found.parts]
+    rows = [_part_row(found, part) for found, part in parts if part.status == "missing" or _is_off(part)]
+    return table(PARTS, rows) if rows else ""
 
 
 def sight_table(sights: Sequence[Sight]) -> str:
@@ -79,6 +93,27 @@ def _found_row(found: DetectionEntry) -> list[str]:
         _number(deviation.mean_m if deviation else None, 1, 1e3),
         _number(deviation.p95_m if deviation else None, 1, 1e3),
         ", ".join(motion.kind for motion in found.unobservable) or "–",
+    ]
+
+
+def _is_off(part: PartEntry) -> bool:
+    return part.off_m is not None and part.off_m > max(OFF_M, 3.0 * (part.off_sigma_m or 0.0))
+
+
+def _part_row(found: DetectionEntry, part: PartEntry) -> list[str]:
+    angle = None if part.turn_rad is None else degrees(hypot(*part.turn_rad))
+    sigma = None if part.turn_sigma_rad is None else degrees(part.turn_sigma_rad)
+    return [
+        str(found.id),
+        part.name,
+        part.status.replace("_", " "),
+        _number(part.off_m, 1, 1e3),
+        _number(part.off_sigma_m, 1, 1e3),
+        *(_number(value, 1, 1e3) for value in part.shift_m or (None, None, None)),
+        _number(angle, 2),
+        _number(sigma, 2),
+        part.joined_to or "–",
+        ", ".join(motion.kind for motion in part.free) or "–",
     ]
 
 
