@@ -13,8 +13,8 @@ from scanfind.pose import Pose
 
 Floats = NDArray[np.float64]
 
-# Off the design from here on: the usual tolerance of a pipe spool's dimensions (ASME B31.3, Pipe Fabrication
-# Institute ES-3: 3 mm).
+# Off the design from here on: what fabricators allow a pipe spool of up to 10 inches (Pipe Fabrication
+# Institute, ES-3: an eighth of an inch).
 OFF_M = 0.003
 
 
