@@ -2,16 +2,16 @@
 
 python -m benchmarks.assemblies --seeds 7200-7299
 
-Each seed makes a spool design, builds it with one branch (or the last leg) bent at its root, short or long, and scans it
-in a shop among other spools. Every other seed gives the model as named parts, the rest as one welded surface. `sibling`
-scenes hold a spool whose branch is elsewhere altogether: that is another part, and finding it is a false alarm, unless
-it is said that the branch is missing.
+Each seed makes a spool design, builds it with one branch (or the last leg) bent at its root, short or long, and scans
+it in a shop among other spools. Every other seed gives the model as named parts, the rest as one welded surface.
+`sibling` scenes hold a spool whose branch is elsewhere altogether: that is another part, and finding it is a false
+alarm, unless it is said that the branch is missing.
 """
 
 from __future__ import annotations
 
 import gc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cyclopts
@@ -138,10 +138,11 @@ def scene_row(seed: int, kind: str, points: int, *, rigid: bool) -> Row:
     part = branch_part(found[best].parts, case) if best >= 0 and found[best].parts else None
     others = [one for one in found[best].parts if one is not part] if best >= 0 else []
     mm, deg = part_error(part, case) if part is not None and part.status == "measured" else (NAN, NAN)
+    told = told_unlike(found) if kind == "sibling" else 0
     return Row(
         seed=seed, kind=kind, branch=branch, model="parts" if named else "surface", points=len(scanned),
         rigid_score=max((one.score for one in found.refused), default=NAN),
-        found=len(right[:1]), false=len(found) - len(right[:1]) - (told := told_unlike(found) if kind == "sibling" else 0),
+        found=len(right[:1]), false=len(found) - len(right[:1]) - told,
         told_unlike=told,
         score=found[best].score if best >= 0 else NAN,
         pose_mm=errors[best].mm if best >= 0 else NAN, pose_deg=errors[best].deg if best >= 0 else NAN,
@@ -172,7 +173,9 @@ def build(rng: np.random.Generator, kind: str, branch: str, *, named: bool) -> B
     bent = Pose(turn.rotation, joint - turn.rotation @ joint + longer * (turn.rotation @ axis))
     built = built_parts(design, kind, branch, bent, longer, rng)
     model = join("spool", designed.parts, "") if named else spool("spool", design)
-    return Built(model, assemble("built", [(mesh, Pose.identity()) for mesh in built]), bent, joint + 0.5 * length * axis)
+    return Built(
+        model, assemble("built", [(mesh, Pose.identity()) for mesh in built]), bent, joint + 0.5 * length * axis
+    )
 
 
 @dataclass(frozen=True)
@@ -201,12 +204,18 @@ def pieces(design: SpoolDesign, longer: dict[str, float] | None = None) -> Piece
     routes["outlet"] = side_branch(second, design.outlet_at, r, small, height + extra["outlet"])
     routes["elbow 2"] = laid(main, lambda: main.bend(design.turn))
     ends["back"] = (main.end.translation, main.end.rotation[:, 2], design.back)
-    routes["back"] = laid(main, lambda: (main.straight(design.back + extra["back"]), main.flange()))
+    routes["back"] = laid(main, lambda: flanged(main, design.back + extra["back"]))
     meshes = {name: assemble(name, placed) for name, placed in routes.items()}
     return Pieces([Part(name, m.vertices, m.faces.astype(np.int64)) for name, m in meshes.items()], ends)
 
 
-def laid(route: Route, lay) -> list[tuple[Mesh, Pose]]:  # type: ignore[no-untyped-def]
+def flanged(route: Route, length: float) -> None:
+    """Go on by `length` and close the end."""
+    route.straight(length)
+    route.flange()
+
+
+def laid(route: Route, lay: Callable[[], None]) -> list[tuple[Mesh, Pose]]:
     """What `lay` adds to a route."""
     before = len(route.placed)
     lay()

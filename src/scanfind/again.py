@@ -58,7 +58,8 @@ def isolate_again(
             tell = progress or (lambda stage, done, total: None)
             say_if_compiling(tell)
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
-            findings = Findings(with_points(found, models.models(), chunks, within, rest, available_cores()))
+            # Of the whole model as designed, also where the search fitted its parts one by one.
+            findings = Findings(with_points(found, models.models(), {}, chunks, within, rest, available_cores()))
         findings.refused, findings.notes = found.refused, found.notes
         findings.shift, findings.crs, findings.tolerance_m = found.shift, found.crs, within
         # Where the scanner stood may have been told to the search by hand.

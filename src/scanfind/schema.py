@@ -75,8 +75,8 @@ class PartEntry(Entry):
     """One part of a found assembly, against the parts that keep to the design; model frame.
 
     `status`: measured; missing: beams passed through most of it; not_seen: too little of it was looked at to say.
-    `joined_to`: the part it hangs on. `shift_m`, of its middle, and `turn_rad`, axis × angle, hold nothing of the motions
-    in `free`, which the scan does not fix; each sigma is one standard deviation in the worst of the other directions.
+    `joined_to`: the part it hangs on. `shift_m`, of its middle, and `turn_rad`, axis × angle, hold nothing of the
+    motions in `free`, which the scan does not fix; each sigma is a standard deviation in the worst of the others.
     `off_m`: how far the point of its surface that moved the most did. All null where it was not measured.
     """
 
@@ -99,8 +99,8 @@ class PartEntry(Entry):
 class DetectionEntry(Entry):
     """One instance of one model. `isolated` and `pose` are files of the result folder, null where none was written.
 
-    `parts` is empty where they were not asked for (`assembly.parts`, --parts) and where the model has but one. With parts,
-    `isolated` and `deviation` are of the parts where they were built.
+    `parts` is empty where they were not asked for (`assembly.parts`, --parts) and where the model has but one. With
+    parts, `isolated` and `deviation` are of the parts where they were built.
     """
 
     id: int

@@ -78,13 +78,15 @@ class Assemblies:
     def faces(self, model: int, whole: Explained) -> Floats:
         """The faces (F, 3, 3) of a model as built, relative to the grid's offset; without its missing parts."""
         fit, mesh = self._fits[model], self._models[model].mesh
-        assert fit is not None and mesh is not None  # else nothing could have been explained
+        assert fit is not None  # else nothing could have been explained
+        assert mesh is not None
         return placed_faces(mesh, fit.assembly, whole.placed, [part.status != MISSING for part in whole.parts])
 
     def measured(self, model: int, whole: Explained, points: Floats) -> Explained:
         """The same, each part fitted to the raw points (N, 3) within REACH_M of it, relative to the grid's offset."""
         fit, mesh = self._fits[model], self._models[model].mesh
-        assert fit is not None and mesh is not None
+        assert fit is not None
+        assert mesh is not None
         placed = fitted_to_points(whole.placed, mesh, fit.assembly, points)
         pose, parts, _ = told(placed, whole.seen, whole.parents, fit.assembly, whole.pose)
         return whole._replace(pose=pose, parts=parts, placed=placed)
@@ -197,7 +199,9 @@ def told_of(
     if status != MEASURED:
         none = (0.0, 0.0, 0.0)
         nan = float("nan")
-        return PartFit(assembly.names[k], status, joined_to, Pose.identity(), none, none, nan, nan, nan, nan, (), *shares)
+        return PartFit(
+            assembly.names[k], status, joined_to, Pose.identity(), none, none, nan, nan, nan, nan, (), *shares
+        )
     centre, radius = assembly.arrays.centres[k], float(assembly.arrays.radii[k])
     turned = np.kron(np.eye(2), reference.rotation)
     information = turned.T @ parts.information[k] @ turned

@@ -84,10 +84,6 @@ class PlacedParts(NamedTuple):
         """scene_from_model of the k-th."""
         return Pose(self.rotations[k], self.translations[k])
 
-    def take(self, which: NDArray[np.integer] | list[int]) -> PlacedParts:
-        """Some of them."""
-        return PlacedParts(*(column[which] for column in self))
-
 
 class PartsFit:
     """Fits the parts of one assembly to one scene."""
@@ -174,7 +170,7 @@ class PartsFit:
             return first.pose(0), seen
         moves = self._trials(part, place)
         tried = self._settle(placed(np.full(len(moves), part), [before @ move for move in moves]), before, place)
-        tried = PlacedParts(*(np.concatenate(pair) for pair in zip(first, tried, strict=True)))
+        tried = joined(first, tried)
         weight = self.view.verify.penalty_weight
         best, most, told = before, -np.inf, None
         for k, found in enumerate(self.evidence(tried)):
@@ -239,9 +235,7 @@ class PartsFit:
         """One Gauss-Newton step of each part."""
         surfels, arrays = level.surfels, self.assembly.arrays
         sizes = np.minimum(self._sizes[parts.numbers], level.samples)
-        rules = replace(
-            self.view.verify, gate_cells=min(4.0, gate / surfels.cell), normal_agreement=NORMALS_AGREE
-        )
+        rules = replace(self.view.verify, gate_cells=min(4.0, gate / surfels.cell), normal_agreement=NORMALS_AGREE)
         _, _, claims = held_against(
             hypotheses(parts), self._unseeing, level._replace(inlier=gate), sizes, arrays, self.view.signed, rules,
             ONE_THREAD,
@@ -368,6 +362,12 @@ def placed(numbers: NDArray[np.int64], poses: list[Pose]) -> PlacedParts:
     count = len(numbers)
     rotations, translations = np.array([p.rotation for p in poses]), np.array([p.translation for p in poses])
     return PlacedParts(numbers, rotations, translations, np.zeros((count, 6, 6)), np.ones(count), np.ones(count))
+
+
+def joined(some: PlacedParts, others: PlacedParts) -> PlacedParts:
+    """Both, end to end."""
+    rest = (np.concatenate([mine, theirs]) for mine, theirs in zip(some[1:], others[1:], strict=True))
+    return PlacedParts(np.concatenate([some.numbers, others.numbers]), *rest)
 
 
 def hypotheses(parts: PlacedParts) -> Hypotheses:

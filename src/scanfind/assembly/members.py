@@ -132,7 +132,9 @@ def voted(corners: Floats, normals: Floats, edges: Edges) -> list[Cylinder]:
     chosen = np.flatnonzero(sound)
     # Rounding may split the votes for one cylinder in two; either half still proposes it.
     rounded = np.round(
-        np.hstack([axes[chosen] / 0.01, foot[chosen] / (0.05 * radii[chosen, None]), np.log(radii[chosen, None]) / 0.05])
+        np.hstack(
+            [axes[chosen] / 0.01, foot[chosen] / (0.05 * radii[chosen, None]), np.log(radii[chosen, None]) / 0.05]
+        )
     ).astype(np.int64)
     _, group = np.unique(rounded, axis=0, return_inverse=True)
     group = group.reshape(-1)
@@ -150,7 +152,8 @@ def lying_on(cylinder: Cylinder, faces: Labels, corners: Floats, normals: Floats
     off = corners[faces] - cylinder.point
     off -= (off @ cylinder.axis)[..., None] * cylinder.axis
     far = np.linalg.norm(off, axis=2)
-    return faces[(np.abs(far - cylinder.radius) < OFF_RADIUS * cylinder.radius).all(axis=1)]
+    on: Labels = faces[(np.abs(far - cylinder.radius) < OFF_RADIUS * cylinder.radius).all(axis=1)]
+    return on
 
 
 def joined_to(
@@ -172,7 +175,7 @@ def joined_to(
 def with_rest(
     part: Labels, count: int, areas: Floats, corners: Floats, edges: Edges
 ) -> tuple[Labels, int]:  # fmt: skip
-    """Faces of no member as bends of their own or with the member they touch along the most edge; and how many parts."""
+    """Faces of no member as bends, or with the member they share the most edge with; and how many parts that makes."""
     points = corners.reshape(-1, 3)
     lengths = np.linalg.norm(points[edges.ends[:, 1]] - points[edges.ends[:, 0]], axis=1)
     settled = part.copy()

@@ -8,6 +8,7 @@ measured by itself (a bolt, a gasket) belongs to the part it touches most.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -167,14 +168,13 @@ def joints_of(counts: Labels, places: Floats, into: Labels) -> tuple[Joint, ...]
     np.add.at(points, (into[:, None], into[None, :]), counts)
     np.add.at(sums, (into[:, None], into[None, :]), places)
     return tuple(
-        Joint(a, b, sums[a, b] / points[a, b], int(points[a, b]))
-        for a, b in np.argwhere(np.triu(points, 1)).tolist()
+        Joint(a, b, sums[a, b] / points[a, b], int(points[a, b])) for a, b in np.argwhere(np.triu(points, 1)).tolist()
     )
 
 
 def arrays_of(points: Floats, normals: Floats, starts: Labels) -> ModelArrays:
     """The samples of parts, end to end, as kernels take those of models; starts : (P + 1,)."""
-    spans = [points[first:end] for first, end in zip(starts[:-1], starts[1:], strict=True)]
+    spans = [points[first:end] for first, end in pairwise(starts)]
     centres = np.array([span.mean(axis=0) for span in spans])
     radii = np.array([
         np.sqrt(((span - centre) ** 2).sum(axis=1).mean()) for span, centre in zip(spans, centres, strict=True)
