@@ -196,7 +196,8 @@ def told_of(
     """What is reported of one part, in the model's own axes."""
     joined_to = assembly.names[parent] if parent >= 0 else None
     shares = (seen.support(), seen.visible_support(), seen.penalty())
-    if status != MEASURED:
+    if status != MEASURED or not parts.information[k].any():
+        status = NOT_SEEN if status == MEASURED else status
         none = (0.0, 0.0, 0.0)
         nan = float("nan")
         return PartFit(
@@ -208,14 +209,12 @@ def told_of(
     values, vectors = np.linalg.eigh(information)
     held = vectors[:, values >= FREE_BELOW * values.mean()]
     fixed = held @ held.T
-    motion = fixed @ turned.T @ motion_from(parts, k, reference, assembly)
-    turn, shift = motion[:3] / radius, motion[3:]
+    built_from_design = without(fixed, reference.inverse() @ parts.pose(k), centre, radius)
+    turn, shift = rotation_vector(built_from_design.rotation), built_from_design.move(centre[None])[0] - centre
     covariance = held @ np.linalg.inv(held.T @ information @ held) @ held.T * parts.noise[k] ** 2 / parts.share[k]
     covariance = ALIKE_SHARE * covariance + fixed * ALIKE_M**2
     sigma_shift = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
     sigma_turn = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])) / radius
-    rotation = rotation_from_vector(turn)
-    built_from_design = Pose(rotation, centre + shift - rotation @ centre)
     points = assembly.points(k)
     moved = built_from_design.move(points) - points
     farthest = int(np.argmax(np.linalg.norm(moved, axis=1)))
@@ -226,6 +225,20 @@ def told_of(
         float(off), float(off_sigma), sigma_shift, sigma_turn,
         unobservable(information, centre, radius, FREE_BELOW), *shares,
     )  # fmt: skip
+
+
+def without(fixed: Floats, motion: Pose, centre: Floats, radius: float) -> Pose:
+    """A part's motion without what the data leave open; fixed : (6, 6) the projection on what they do not.
+
+    Undone as motions, step by step: the vectors of a roll by 3° and a bend by 5° do not add up by 0.13°.
+    """
+    for _ in range(4):
+        shift = motion.move(centre[None])[0] - centre
+        vector = np.concatenate([rotation_vector(motion.rotation) * radius, shift])
+        loose = vector - fixed @ vector
+        rotation = nearest_rotation(rotation_from_vector(-loose[:3] / radius) @ motion.rotation)
+        motion = Pose(rotation, centre + shift - loose[3:] - rotation @ centre)
+    return motion
 
 
 def forgiven(

@@ -2,8 +2,8 @@
 
 One step is one of point-to-plane ICP with two changes. Motions are weighed by the model's own normals, which are exact:
 along a straight pipe and about it they have no say at all, where a surfel's normal, wrong by noise, would. And every
-part is tied to where its neighbours would have it, by springs so soft (20 mm, 3°) that any surface that is seen
-outweighs them a thousandfold: they hold what the scan leaves open, and nothing else.
+part is tied to its neighbours, by springs so soft (20 mm, 3°) that any surface that is seen outweighs them a
+thousandfold: they hold what the scan leaves open, and nothing else.
 """
 
 from __future__ import annotations
@@ -34,6 +34,10 @@ LEAST_NOISE_M = 5e-4  # of a surfel: a scan that fits better still does not bind
 # From as far as parts may be off to as near as surfels tell, each part by itself; then all together.
 WIDE_STEPS, FINE_STEPS, STEPS, LAST_CELLS = 6, 4, 10, 0.5
 WIDE_SAMPLES = 200  # of a part, while it is looked for within centimetres
+TRIAL_SAMPLES = 400  # of a part, at each of the places it is tried at
+# Of the way a part may be off: where it is tried along its axis, across it, and bent. The fit closes what lies between.
+SLID, ASIDE, BENT = (0.3, 0.6, 0.9), 0.6, (0.4, 0.8)
+LEAST_GATE_M = 0.02  # of the first of the fine steps: half of what lies between two trials, and some more
 NORMALS_AGREE = 0.7  # as in the refinement of whole poses
 # A part that most of its looked-at surface supports where its neighbour has it is where it should be.
 SETTLED = 0.95
@@ -163,13 +167,14 @@ class PartsFit:
 
     def _one(self, part: int, before: Pose, place: Floats) -> tuple[Pose, Evidence]:
         """Where a part is that its neighbour would have at `before`, scene_from_model, joined at `place` (3,)."""
-        first = self._settle(placed(np.array([part]), [before]), before, place)
+        first = self._settle(placed(np.array([part]), [before]), place, [*self._wide(), *self._narrow()])
         seen = self.evidence(first)[0]
         enough = self.view.verify.min_support * seen.samples
         if seen.supported >= enough and seen.visible_support() >= SETTLED and self._near(first.pose(0), before, place):
             return first.pose(0), seen
         moves = self._trials(part, place)
-        tried = self._settle(placed(np.full(len(moves), part), [before @ move for move in moves]), before, place)
+        tried = placed(np.full(len(moves), part), [before @ move for move in moves])
+        tried = self._settle(tried, place, self._narrow(TRIAL_SAMPLES))
         tried = joined(first, tried)
         weight = self.view.verify.penalty_weight
         best, most, told = before, -np.inf, None
@@ -185,17 +190,19 @@ class PartsFit:
         return best, told or self.evidence(placed(np.array([part]), [before]))[0]
 
     def _trials(self, part: int, place: Floats) -> list[Pose]:
-        """Motions of a part, model frame, about a joint: bent either way about two axes, slid along three."""
+        """Motions of a part, model frame, about a joint: slid along its axis, set aside, bent about two axes."""
         along = self.assembly.arrays.centres[part] - place
         if np.linalg.norm(along) < 1e-6:
             along = np.array([0.0, 0.0, 1.0])
         along = along / np.linalg.norm(along)
         axes = np.linalg.svd(along[None])[2]
-        turn, slide = np.radians(0.7 * self.parameters.most_turn_deg), 0.6 * self.parameters.most_shift_m
-        moves = [Pose(np.eye(3), sign * slide * axis) for axis in axes for sign in (1.0, -1.0)]
+        turn, shift = np.radians(self.parameters.most_turn_deg), self.parameters.most_shift_m
+        shifts = [sign * share * along for share in SLID for sign in (1.0, -1.0)]
+        shifts += [sign * ASIDE * axis for axis in axes[1:] for sign in (1.0, -1.0)]
+        moves = [Pose(np.eye(3), shift * way) for way in shifts]
         for axis in axes[1:]:
-            for sign in (1.0, -1.0):
-                rotation = rotation_from_vector(sign * turn * axis)
+            for share in (*BENT, *(-share for share in BENT)):
+                rotation = rotation_from_vector(share * turn * axis)
                 moves.append(Pose(rotation, place - rotation @ place))
         return moves
 
@@ -203,33 +210,35 @@ class PartsFit:
         gap, turn = apart(pose, before, place)
         return gap <= self.parameters.most_shift_m and np.degrees(turn) <= self.parameters.most_turn_deg
 
-    def _settle(self, parts: PlacedParts, before: Pose, place: Floats) -> PlacedParts:
-        """Fit several poses of parts, each by itself, tied to where `before` has `place`."""
+    def _settle(self, parts: PlacedParts, place: Floats, steps: list[tuple[Level, float]]) -> PlacedParts:
+        """Fit several poses of parts, each by itself, tied at `place` (3,) to where it began."""
         count = len(parts.numbers)
-        hinges = Hinges(
-            np.arange(count), np.tile(place, (count, 1)), np.tile(before.rotation, (count, 1, 1)),
-            np.tile(before.translation, (count, 1)),
-        )  # fmt: skip
-        for level, gate in self._gates():
+        hinges = Hinges(np.arange(count), np.tile(place, (count, 1)), parts.rotations, parts.translations)
+        for level, gate in steps:
             parts = self._step(parts, level, gate, hinges)
         return parts
 
     def _together(self, parts: PlacedParts) -> PlacedParts:
-        """Fit all parts at once, each tied to where its neighbours are at the step before."""
+        """Fit all parts at once, each tied to its neighbours as it is to them now."""
+        rest = parts
         fine = self.view.fine
         for gate in np.geomspace(1.0, LAST_CELLS, STEPS) * fine.surfels.cell:
-            hinges = hinges_of(self.assembly.joints, parts)
+            hinges = hinges_of(self.assembly.joints, parts, rest)
             parts = self._step(parts, fine, max(gate, 3.0 * self.view.scene.noise), hinges)
         return parts
 
-    def _gates(self) -> list[tuple[Level, float]]:
-        """Levels and gates, metres, of the steps of a part by itself."""
-        coarse, fine = self.view.thin, self.view.fine
+    def _wide(self) -> list[tuple[Level, float]]:
+        """Steps from several centimetres away: levels and gates, metres."""
+        coarse, fine = self.view.thin._replace(samples=WIDE_SAMPLES), self.view.fine
         far = min(0.75 * self.parameters.most_shift_m, 4.0 * coarse.surfels.cell)
         near = min(1.2 * fine.surfels.cell, far)
-        coarse = coarse._replace(samples=WIDE_SAMPLES)
-        wide = [(coarse, float(gate)) for gate in np.geomspace(far, near, WIDE_STEPS)]
-        return wide + [(fine, float(gate)) for gate in np.geomspace(near, 0.6 * near, FINE_STEPS)]
+        return [(coarse, float(gate)) for gate in np.geomspace(far, near, WIDE_STEPS)]
+
+    def _narrow(self, samples: int | None = None) -> list[tuple[Level, float]]:
+        """Steps from near by."""
+        fine = self.view.fine if samples is None else self.view.fine._replace(samples=samples)
+        cell = fine.surfels.cell
+        return [(fine, float(gate)) for gate in np.geomspace(max(cell, LEAST_GATE_M), LAST_CELLS * cell, FINE_STEPS)]
 
     def _step(self, parts: PlacedParts, level: Level, gate: float, hinges: Hinges) -> PlacedParts:
         """One Gauss-Newton step of each part."""
@@ -311,12 +320,19 @@ def tukey(gaps: Floats, gate: float) -> Floats:
     return weights
 
 
-def hinges_of(joints: Sequence[Joint], parts: PlacedParts) -> Hinges:
-    """Every part of an assembly, in their order, tied to where its neighbours are."""
+def hinges_of(joints: Sequence[Joint], parts: PlacedParts, rest: PlacedParts) -> Hinges:
+    """Every part of an assembly, in their order, tied to its neighbours as it is to them at `rest`.
+
+    Not as the design has it: a leg whose slide nothing but its end tells was slid to where its end is, and stays there.
+    """
     pairs = [tied for joint in joints for tied in ((joint.a, joint.b), (joint.b, joint.a))]
     of, others = np.array(pairs, np.int64).reshape(-1, 2).T
     places = np.repeat(np.array([joint.place for joint in joints]).reshape(-1, 3), 2, axis=0)
-    return Hinges(of, places, parts.rotations[others], parts.translations[others])
+    anchors = [
+        parts.pose(b) @ rest.pose(b).inverse() @ rest.pose(a) for a, b in zip(of.tolist(), others.tolist(), strict=True)
+    ]
+    rotations = np.array([one.rotation for one in anchors]).reshape(-1, 3, 3)
+    return Hinges(of, places, rotations, np.array([one.translation for one in anchors]).reshape(-1, 3))
 
 
 def springs(parts: PlacedParts, hinges: Hinges, centres: Floats, radii: Floats) -> tuple[Floats, Floats]:

@@ -35,7 +35,10 @@ APART_M = 0.005
 
 
 def fitted_to_points(parts: PlacedParts, mesh: Mesh, assembly: Assembly, points: Floats) -> PlacedParts:
-    """The parts of one placed model, in their order, fitted to raw points (N, 3) within REACH_M, the parts' frame."""
+    """The parts of one placed model, in their order, fitted to raw points (N, 3) within REACH_M, the parts' frame.
+
+    A part that meets too few of them stays as it is.
+    """
     corners = mesh.triangles()
     own = [corners[assembly.part_of_face == k] for k in range(len(assembly.names))]
     # Points are told apart by the parts as they were placed by the surfels, within which they hardly move now.
@@ -48,10 +51,14 @@ def fitted_to_points(parts: PlacedParts, mesh: Mesh, assembly: Assembly, points:
     clear = (two[0] <= REACH_M) & (two[1] >= two[0] + APART_M)
     mine = [spread_out(np.flatnonzero(clear & (nearest == k))) for k in range(len(own))]
     normals = [face_normals(faces) for faces in own]
+    fitted = parts
     for gate in REACH_M * SHRINK ** np.arange(STEPS):
-        found = [met(parts.pose(k), surfaces[k], normals[k], points[mine[k]], gate) for k in range(len(own))]
-        parts = stepped(parts, found, hinges_of(assembly.joints, parts), assembly.arrays)
-    return parts
+        found = [met(fitted.pose(k), surfaces[k], normals[k], points[mine[k]], gate) for k in range(len(own))]
+        fitted = stepped(fitted, found, hinges_of(assembly.joints, fitted, parts), assembly.arrays)
+    for k in np.flatnonzero([not len(one.gaps) for one in found]):
+        for column, before in zip(fitted[1:], parts[1:], strict=True):
+            column[k] = before[k]
+    return fitted
 
 
 def met(pose: Pose, surface: NearSurface, normals: Floats, points: Floats, gate: float) -> Matches:
