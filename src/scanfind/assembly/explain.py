@@ -18,7 +18,7 @@ from scanfind.assembly.parts import Assembly, assembly_of
 from scanfind.assembly.points import fitted_to_points, placed_faces
 from scanfind.detection import PartFit
 from scanfind.pose import Pose, nearest_rotation, rotation_from_vector
-from scanfind.refine import triple, unobservable
+from scanfind.refine import motion_of, triple
 from scanfind.verify import Evidence, why_refused
 
 if TYPE_CHECKING:
@@ -33,9 +33,10 @@ LEAST_SUPPORTED, LEAST_SHOWN = 20, 0.08
 THERE = 0.5  # share of what scanners could see of a part that must be there for it to be there
 # Parts whose surface lies within this of where the design puts it, rms, keep to it: as a scan's noise is.
 KEEPS_M = 0.002
-# A motion the data hold less than this share of the mean is free: facets hold the roll of a cylinder by 0.003, and the
-# oblique ones around a branch its slide by 0.013; the face of a flange holds the slide of a leg of 1 m by 0.15.
-FREE_BELOW = 0.02
+# A motion is free where less than this of what it moves the surface by, squared, is across the surface. Facets make
+# 0.0014 of a cylinder's roll (24 of them 0.006), oblique ones around a branch 0.004 of its slide; the face of a flange
+# is 0.1 of the slide of a leg of 1 m, and a square bar rolls across itself by 0.25.
+FREE_BELOW = 0.01
 # Surfels near each other err alike (bent surface, mixed pixels), which their residuals do not show.
 ALIKE_M, ALIKE_SHARE = 1e-4, 3.0
 
@@ -206,25 +207,56 @@ def told_of(
     centre, radius = assembly.arrays.centres[k], float(assembly.arrays.radii[k])
     turned = np.kron(np.eye(2), reference.rotation)
     information = turned.T @ parts.information[k] @ turned
-    values, vectors = np.linalg.eigh(information)
-    held = vectors[:, values >= FREE_BELOW * values.mean()]
-    fixed = held @ held.T
-    built_from_design = without(fixed, reference.inverse() @ parts.pose(k), centre, radius)
+    moved = reference.inverse() @ parts.pose(k)
+    arms, normals = moved.turn(assembly.points(k) - centre), moved.turn(assembly.normals(k))
+    moving = moved_by(arms, radius)
+    # What its shape leaves free is so by exactly that motion: of one side that was seen it is the nearest only.
+    rows = np.hstack([np.cross(arms, normals) / radius, normals])
+    _, _, by_shape = free_and_held(rows.T @ rows, moving)
+    information = by_shape.T @ information @ by_shape
+    free, held, fixed = free_and_held(information, moving)
+    built_from_design = without(fixed, moved, centre, radius)
     turn, shift = rotation_vector(built_from_design.rotation), built_from_design.move(centre[None])[0] - centre
     covariance = held @ np.linalg.inv(held.T @ information @ held) @ held.T * parts.noise[k] ** 2 / parts.share[k]
-    covariance = ALIKE_SHARE * covariance + fixed * ALIKE_M**2
+    covariance = fixed @ (ALIKE_SHARE * covariance + np.eye(6) * ALIKE_M**2) @ fixed.T
     sigma_shift = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
     sigma_turn = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])) / radius
     points = assembly.points(k)
-    moved = built_from_design.move(points) - points
-    farthest = int(np.argmax(np.linalg.norm(moved, axis=1)))
+    shifts = built_from_design.move(points) - points
+    farthest = int(np.argmax(np.linalg.norm(shifts, axis=1)))
     lever = np.hstack([-skew(points[farthest] - centre) / radius, np.eye(3)])
-    off, off_sigma = np.linalg.norm(moved[farthest]), np.sqrt(np.linalg.eigvalsh(lever @ covariance @ lever.T)[-1])
+    off, off_sigma = np.linalg.norm(shifts[farthest]), np.sqrt(np.linalg.eigvalsh(lever @ covariance @ lever.T)[-1])
     return PartFit(
         assembly.names[k], status, joined_to, built_from_design, triple(shift), triple(turn),
         float(off), float(off_sigma), sigma_shift, sigma_turn,
-        unobservable(information, centre, radius, FREE_BELOW), *shares,
+        tuple(motion_of(vector, centre, radius) for vector in free.T), *shares,
     )  # fmt: skip
+
+
+def moved_by(arms: Floats, radius: float) -> Floats:
+    """(6, 6): how far motions in (rotation × radius, translation) move N points at `arms` (N, 3), mean square."""
+    turns = np.stack([-skew(arm) / radius for arm in arms])
+    rows = np.concatenate([turns, np.broadcast_to(np.eye(3), turns.shape)], axis=2).reshape(-1, 6)
+    return np.asarray(rows.T @ rows / len(arms)) + 1e-9 * np.eye(6)
+
+
+def free_and_held(information: Floats, moving: Floats) -> tuple[Floats, Floats, Floats]:
+    """The motions the data leave free (6, F), those they hold (6, 6 - F), and a projection (6, 6) on motions without.
+
+    What it leaves does not turn about the axis of a free roll, and does not shift along that of a free slide.
+    information : (6, 6) of the matched samples; moving : (6, 6), see `moved_by`
+    """
+    across = information / np.trace(information[3:, 3:])  # unit normals: the sum of the weights
+    scale = np.linalg.inv(np.linalg.cholesky(moving)).T
+    shares, vectors = np.linalg.eigh(scale.T @ across @ scale)
+    vectors = scale @ vectors
+    free, held = vectors[:, shares < FREE_BELOW], vectors[:, shares >= FREE_BELOW]
+    rolls = [np.linalg.norm(vector[:3]) > np.linalg.norm(vector[3:]) for vector in free.T]
+    along = np.array([
+        [*vector[:3], 0.0, 0.0, 0.0] if roll else [0.0, 0.0, 0.0, *vector[3:]]
+        for vector, roll in zip(free.T, rolls, strict=True)
+    ]).reshape(-1, 6)  # fmt: skip
+    return free, held, np.eye(6) - free @ np.linalg.solve(along @ free, along)
 
 
 def without(fixed: Floats, motion: Pose, centre: Floats, radius: float) -> Pose:

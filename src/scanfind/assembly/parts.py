@@ -65,6 +65,10 @@ class Assembly:
         """The samples of a part, (N, 3), model frame."""
         return self.arrays.points[self.arrays.starts[part] : self.arrays.starts[part + 1]]
 
+    def normals(self, part: int) -> Floats:
+        """The unit normals of the same, (N, 3)."""
+        return self.arrays.normals[self.arrays.starts[part] : self.arrays.starts[part + 1]]
+
 
 def assembly_of(mesh: Mesh, surface: SurfaceParameters) -> Assembly | None:
     """The parts of a mesh; None where there is but one.
