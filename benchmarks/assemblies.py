@@ -23,7 +23,7 @@ from scanfind.assembly import AssemblyParameters
 from scanfind.assembly.parts import first_cut
 from scanfind.detection import PartFit
 from scanfind.errors import UsageError
-from scanfind.mesh import Mesh
+from scanfind.mesh import Mesh, doubled_areas
 from scanfind.models.parts import Part, join
 from scanfind.pose import Pose
 from scanfind.simulate.equipment import TOWARDS_X
@@ -258,10 +258,11 @@ def built_parts(
 
 
 def branch_part(parts: Sequence[PartFit], case: Built) -> PartFit:
-    """The part of the model that is the branch: the one whose faces lie nearest to its middle."""
+    """The part of the model that is the branch: the one whose surface has its middle nearest to the branch's."""
     part, names = first_cut(case.design)
-    middles = case.design.triangles().mean(axis=1)
-    near = [float(np.linalg.norm(middles[part == k] - case.middle, axis=1).min()) for k in range(len(names))]
+    middles, areas = case.design.triangles().mean(axis=1), doubled_areas(case.design.vertices, case.design.faces)
+    whole = [np.average(middles[part == k], axis=0, weights=areas[part == k]) for k in range(len(names))]
+    near = [float(np.linalg.norm(middle - case.middle)) for middle in whole]
     # The design is sought under the names of its cut, from which small parts may have gone.
     left = {one.name: one for one in parts}
     order = [names[k] for k in np.argsort(near) if names[k] in left]

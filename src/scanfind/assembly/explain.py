@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.assembly.fit import PartsFit, PlacedParts, View, rotation_vector, skew
+from scanfind.assembly.fit import PartsFit, PlacedParts, View, apart, rotation_vector, skew
 from scanfind.assembly.parts import Assembly, assembly_of
 from scanfind.assembly.points import fitted_to_points, placed_faces
 from scanfind.detection import PartFit
@@ -109,11 +109,33 @@ def explained(fit: PartsFit, pose: Pose, blind: bool, *, believed: bool) -> Expl
     assembly, parameters, verify = fit.assembly, fit.parameters, fit.view.verify
     reference, fits, kept = told(parts, seen, parents, assembly, pose)
     spared = forgiven(assembly, [part.status for part in fits], seen, parameters.most_missing)
+    strained = beyond_bounds(parents, fits, fit)
     evidence = together([one for one, spare in zip(seen, spared, strict=True) if not spare])
     reason = why_refused(evidence, blind, verify)
     if not reason and kept < parameters.least_kept:
         reason = f"only {kept:.0%} of what is seen of it keeps to the design, {parameters.least_kept:.0%} is asked for"
+    lost = [part.name for part, spare in zip(fits, spared, strict=True) if part.status == MISSING and not spare]
+    if not reason and (lost or strained):
+        reason = f"{lost[0]} is missing" if lost else f"{strained} is farther off than a part may be"
     return Explained(reference, fits, evidence, reason, parts, seen, parents)
+
+
+def beyond_bounds(parents: NDArray[np.int64], fits: Sequence[PartFit], fit: PartsFit) -> str:
+    """The name of a measured part that has left the one it hangs on farther than parts may; empty where none has."""
+    for k, parent in enumerate(parents.tolist()):
+        if parent < 0 or {fits[k].status, fits[parent].status} != {MEASURED}:
+            continue
+        mine, theirs = fits[k].built_from_design, fits[parent].built_from_design
+        gap, turn = apart(mine, theirs, place_of(fit.assembly, k, parent))
+        if gap > fit.parameters.most_shift_m or np.degrees(turn) > fit.parameters.most_turn_deg:
+            return fits[k].name
+    return ""
+
+
+def place_of(assembly: Assembly, one: int, other: int) -> Floats:
+    """Where two parts join (3,), model frame; where they do not touch, the middle of the first."""
+    places = [joint.place for joint in assembly.joints if {joint.a, joint.b} == {one, other}]
+    return places[0] if places else assembly.arrays.centres[one]
 
 
 def told(
@@ -251,6 +273,8 @@ def free_and_held(information: Floats, moving: Floats) -> tuple[Floats, Floats, 
     shares, vectors = np.linalg.eigh(scale.T @ across @ scale)
     vectors = scale @ vectors
     free, held = vectors[:, shares < FREE_BELOW], vectors[:, shares >= FREE_BELOW]
+    # A pipe rolls and slides, and so does any screw: of such, those that turn the most and the least.
+    free = free @ np.linalg.svd(free[:3])[2].T if free.shape[1] else free
     rolls = [np.linalg.norm(vector[:3]) > np.linalg.norm(vector[3:]) for vector in free.T]
     along = np.array([
         [*vector[:3], 0.0, 0.0, 0.0] if roll else [0.0, 0.0, 0.0, *vector[3:]]
