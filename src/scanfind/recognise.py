@@ -47,6 +47,7 @@ ALL_SAMPLES = 1 << 30
 # Share of the score asked for that the evidence on the coarse surfels must reach: there 400 samples tell the final
 # score of a shop's 96 best poses within 0.2.
 PROMISING = 0.67
+WEARY = 12  # poses of a model tried in parts, from which on only what comes closer than any of these is tried
 REFUSED_SHOWN = 3  # of each model: what came closest
 
 
@@ -246,9 +247,13 @@ class Recognition:
         for candidate in believed:
             self._claim(candidate, claimed)
         tried = dict.fromkeys(range(len(self.models)), 0)
+        best = {model: max((c.score for c in self._tried_in_parts if c.model == model), default=0.0) for model in tried}
+        weary = {model: sum(c.model == model for c in self._tried_in_parts) >= WEARY for model in tried}
         for candidate in sorted(refused, key=lambda c: -c.score):
             model = candidate.model
             if candidate.score < limits.least_score or tried[model] >= limits.tried or self._shares(candidate, claimed):
+                continue
+            if weary[model] and candidate.score <= best[model]:
                 continue
             if any(other.model == model and self._coincide(candidate, other) for other in self._tried_in_parts):
                 continue

@@ -35,12 +35,15 @@ LEAST_NOISE_M = 5e-4  # of a surfel: a scan that fits better still does not bind
 WIDE_STEPS, FINE_STEPS, STEPS, LAST_CELLS = 6, 4, 10, 0.5
 WIDE_SAMPLES = 200  # of a part, while it is looked for within centimetres
 TRIAL_SAMPLES = 400  # of a part, at each of the places it is tried at
-# Of the way a part may be off: where it is tried along its axis, across it, and bent. The fit closes what lies between.
-SLID, ASIDE, BENT = (0.3, 0.6, 0.9), 0.6, (0.4, 0.8)
+# Of the way a part may be off: where it is tried along its axis, across it, and bent, towards so many sides. The fit
+# closes what lies between. Twice, from the best so far: a leg may be bent and short.
+SLID, ASIDE, BENT, SIDES = (0.3, 0.6, 0.9), 0.6, (0.35, 0.75), 8
+ROUNDS = 2
 LEAST_GATE_M = 0.02  # of the first of the fine steps: half of what lies between two trials, and some more
 NORMALS_AGREE = 0.7  # as in the refinement of whole poses
 # A part that most of its looked-at surface supports where its neighbour has it is where it should be.
-SETTLED = 0.95
+SETTLED = 0.99
+MISLED_M = 0.003  # a part set off this far by the one it hangs on may have been misled by it
 ONE_THREAD = 1  # a step takes a millisecond, as the start of a thread does
 
 
@@ -115,6 +118,11 @@ class PartsFit:
         for part in order:
             before = poses[parents[part]] if parents[part] >= 0 else pose
             poses[part], found = self._one(part, before, places[part])
+            if not self._settled(found) and apart(before, poses[root], places[part])[0] > MISLED_M:
+                # An elbow can turn within itself and be nearly right; what comes after it would be far out.
+                straight, seen_so = self._one(part, poses[root], places[part])
+                if self._net(seen_so) > self._net(found):
+                    poses[part], found = straight, seen_so
             tally += [found.supported - found.samples, found.seen_through]
             if not believed and self._hopeless(*tally):
                 return None
@@ -169,28 +177,41 @@ class PartsFit:
         """Where a part is that its neighbour would have at `before`, scene_from_model, joined at `place` (3,)."""
         first = self._settle(placed(np.array([part]), [before]), place, [*self._wide(), *self._narrow()])
         seen = self.evidence(first)[0]
-        enough = self.view.verify.min_support * seen.samples
-        if seen.supported >= enough and seen.visible_support() >= SETTLED and self._near(first.pose(0), before, place):
+        if self._settled(seen) and self._near(first.pose(0), before, place):
             return first.pose(0), seen
-        moves = self._trials(part, place)
-        tried = placed(np.full(len(moves), part), [before @ move for move in moves])
-        tried = self._settle(tried, place, self._narrow(TRIAL_SAMPLES))
-        tried = joined(first, tried)
-        weight = self.view.verify.penalty_weight
-        best, most, told = before, -np.inf, None
-        for k, found in enumerate(self.evidence(tried)):
-            if not self._near(tried.pose(k), before, place):
-                continue
-            # Of poses that explain the same, the one nearer to the design: a tenth of the samples for all of the way.
-            gap, turn = apart(tried.pose(k), before, place)
-            strain = gap / self.parameters.most_shift_m + np.degrees(turn) / self.parameters.most_turn_deg
-            value = found.supported - weight * found.seen_through - 0.05 * strain * found.samples
-            if value > most:
-                best, most, told = tried.pose(k), value, found
-        return best, told or self.evidence(placed(np.array([part]), [before]))[0]
+        start, told, most = before, seen, -np.inf
+        for _ in range(ROUNDS):
+            moves = self._trials(part, place)
+            tried = placed(np.full(len(moves), part), [start @ move for move in moves])
+            tried = joined(first, self._settle(tried, place, self._narrow(TRIAL_SAMPLES)))
+            for k, found in enumerate(self.evidence(tried)):
+                value = self._worth(tried.pose(k), found, before, place)
+                if value > most:
+                    start, told, most = tried.pose(k), found, value
+            if told.visible_support() >= SETTLED or not self._settled(told, share=0.0):
+                break
+        # Where it cannot be, within bounds, it is where its neighbour would have it.
+        return (start, told) if most > -np.inf else (before, self.evidence(placed(first.numbers, [before]))[0])
+
+    def _settled(self, seen: Evidence, share: float = SETTLED) -> bool:
+        """Is enough of a part there, and so large a share of what could be seen of it?"""
+        return seen.support() >= self.view.verify.min_support and seen.visible_support() >= share
+
+    def _net(self, seen: Evidence) -> float:
+        """Samples for, less those against."""
+        return seen.supported - self.view.verify.penalty_weight * seen.seen_through
+
+    def _worth(self, pose: Pose, found: Evidence, before: Pose, place: Floats) -> float:
+        """What speaks for a part being at a pose, in samples; -inf beyond the bounds."""
+        if not self._near(pose, before, place):
+            return -np.inf
+        # Of poses that explain the same, the one nearer to the design: a twentieth of the samples for all of the way.
+        gap, turn = apart(pose, before, place)
+        strain = gap / self.parameters.most_shift_m + float(np.degrees(turn)) / self.parameters.most_turn_deg
+        return self._net(found) - 0.05 * strain * found.samples
 
     def _trials(self, part: int, place: Floats) -> list[Pose]:
-        """Motions of a part, model frame, about a joint: slid along its axis, set aside, bent about two axes."""
+        """Motions of a part, model frame, about a joint: slid along its axis, set aside, bent to all sides."""
         along = self.assembly.arrays.centres[part] - place
         if np.linalg.norm(along) < 1e-6:
             along = np.array([0.0, 0.0, 1.0])
@@ -200,10 +221,10 @@ class PartsFit:
         shifts = [sign * share * along for share in SLID for sign in (1.0, -1.0)]
         shifts += [sign * ASIDE * axis for axis in axes[1:] for sign in (1.0, -1.0)]
         moves = [Pose(np.eye(3), shift * way) for way in shifts]
-        for axis in axes[1:]:
-            for share in (*BENT, *(-share for share in BENT)):
-                rotation = rotation_from_vector(share * turn * axis)
-                moves.append(Pose(rotation, place - rotation @ place))
+        for angle in 2.0 * np.pi * np.arange(SIDES) / SIDES:
+            axis = np.cos(angle) * axes[1] + np.sin(angle) * axes[2]
+            rotations = [rotation_from_vector(share * turn * axis) for share in BENT]
+            moves += [Pose(rotation, place - rotation @ place) for rotation in rotations]
         return moves
 
     def _near(self, pose: Pose, before: Pose, place: Floats) -> bool:
