@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from scanfind.depth import DepthMap
 from scanfind.errors import require
-from scanfind.moments import MomentGrid
-from scanfind.surfels import Surfels, empty_hash
+from scanfind.moments import MomentGrid, empty_hash
+from scanfind.surfels import Surfels
 
 Floats = NDArray[np.float64]
 
@@ -193,4 +193,4 @@ def orientation_grid(surfels: Surfels, reach: float, cell: float) -> Orientation
         block_keys = np.concatenate([block_keys, np.empty_like(block_keys)])
         masks = np.concatenate([masks, np.empty_like(masks)])
         hash_keys, hash_values = empty_hash(2 * room)
-        fill_hash(block_keys[: counts[0]], hash_keys, hash_values)
+        fill_hash(block_keys, np.arange(counts[0]), hash_keys, hash_values)

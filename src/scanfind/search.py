@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.errors import require
+from scanfind.moments import empty_hash
 from scanfind.pairs import rung_distance, rungs_of
 from scanfind.scene import flatness_above
-from scanfind.surfels import empty_hash
 from scanfind.threads import in_threads
 
 if TYPE_CHECKING:
@@ -441,7 +441,7 @@ def bin_pool(pool: NDArray[np.intp], means: Floats, distance: float, tolerance: 
     bins, starts = np.unique(keys[order], return_index=True)
     starts = np.append(starts, len(pool))
     hash_keys, hash_values = empty_hash(len(bins))
-    fill_hash(bins, hash_keys, hash_values)
+    fill_hash(bins, np.arange(len(bins)), hash_keys, hash_values)
     return Bins(
         pool[order], points[order], np.repeat(np.arange(len(bins)), np.diff(starts)), bins, hash_keys, hash_values,
         starts, shell_of(distance / edge, tolerance / edge), -1.0,
