@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 import naive
 from scanfind.cloud import PointChunk
 from scanfind.detection import Motion
-from scanfind.kernels.nearest import nearest_surfel
+from scanfind.kernels.blocks import unpack_block
+from scanfind.kernels.nearest import mark_around, mark_rows, nearest_surfel
 from scanfind.mesh import Mesh
 from scanfind.model import Model, ModelParameters, build_model
 from scanfind.moments import MomentGrid
@@ -192,6 +193,21 @@ def scattered() -> Surfels:
     grid.add(PointChunk(points, {}, np.arange(3000), origin=np.full(3, 4.0)))
     grid.add(PointChunk(points + 0.01, {}, np.arange(3000), origin=np.full(3, -4.0)))
     return Surfels(grid).fit()
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**32), st.integers(0, 8), st.integers(1, 40))
+def test_marked_are_the_cells_of_a_cube_about_each_point(seed: int, reach: int, count: int) -> None:
+    points = np.random.default_rng(seed).uniform(-1.3, 1.3, (count, 3))
+    cells = scattered().cells
+    layers, marked = np.zeros((len(cells.block_rows), 8), np.uint64), np.zeros(len(scattered().sides), np.bool_)
+    mark_around(points, reach, cells.cell, cells.hash_keys, cells.hash_values, layers)
+    mark_rows(cells.order, layers, cells.block_rows, marked)
+    blocks = np.repeat(cells.order, np.diff(cells.first_cell))
+    corners = np.array([unpack_block(key) for key in cells.block_keys[blocks]]) * 8
+    places = corners + np.stack([cells.locals >> 6, (cells.locals >> 3) & 7, cells.locals & 7], axis=1)
+    apart = np.abs(places[:, None] - np.floor(points / cells.cell)).max(axis=2).min(axis=1)
+    np.testing.assert_array_equal(marked[cells.rows], apart <= reach)
 
 
 # ── self-similar poses ──

@@ -165,10 +165,12 @@ class Recognition:
 
     def _fit_near(self, hypotheses: Hypotheses, reach: int) -> None:
         """Fit the fine surfels up to `reach` cells from the placed samples of some poses."""
-        near = self._no_rows()
+        placed, starts = [np.empty((0, 3))], self.arrays.starts
         for number, rotation, translation in zip(*hypotheses[:3], strict=True):
-            samples = self.arrays.points[self.arrays.starts[number] : self.arrays.starts[number + 1]]
-            self._mark(samples @ rotation.T + translation, reach, near)
+            samples = self.arrays.points[starts[number] : starts[number + 1]]
+            placed.append(samples @ rotation.T + translation)
+        near = self._no_rows()
+        self._mark(np.concatenate(placed), reach, near)
         self.scene.fine.fit(near[self.scene.fine.cells.rows])
 
     def _no_rows(self) -> NDArray[np.bool_]:
@@ -248,10 +250,12 @@ class Recognition:
 
     def _mark(self, points: Floats, reach: int, marked: NDArray[np.bool_]) -> None:
         """Mark the rows of the fine cells up to `reach` cells from points (N, 3)."""
-        from scanfind.kernels.nearest import mark_around
+        from scanfind.kernels.nearest import mark_around, mark_rows
 
         at = self.scene.fine.cells
-        mark_around(points, reach, at.cell, at.hash_keys, at.hash_values, at.block_rows, marked)
+        layers = np.zeros((len(at.block_rows), 8), np.uint64)
+        mark_around(points, reach, at.cell, at.hash_keys, at.hash_values, layers)
+        mark_rows(at.order, layers, at.block_rows, marked)
 
     def _hits(self, hypotheses: Hypotheses, found: Candidate) -> int:
         """How many of a round's hypotheses lead to a pose, or to one it is turned onto by the model's symmetry."""

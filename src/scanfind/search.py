@@ -29,6 +29,7 @@ AREA_OF_A_SAMPLE = 1.4
 LEARNT = 0.5
 # Cells drawn from: fewer make pairs that repeat each other, more cost more to fit than they add to a round's pairs.
 LEAST_POOL, MOST_POOL = 20_000, 100_000
+ROUNDS_A_POOL = 4  # draw from mostly the same cells, which are fitted then; small parts need others in the long run
 # Rounds after the first: a little more than is missing, and enough to be worth refining.
 ROUND_MARGIN, LEAST_ROUND = 1.1, 0.2
 # With so many scanner positions nearly every sample faces one, and asking costs more than it tells.
@@ -214,7 +215,7 @@ class Search:
         while 0 < np.minimum(kept, 1.0) @ counts < min(LEAST_POOL, 0.9 * counts.sum()):
             kept = kept * 1.25
         self._kept = np.minimum(kept, 1.0)
-        luck = np.random.default_rng([self.seed, self.rounds]).random(len(self._classes), np.float32)
+        luck = np.random.default_rng([self.seed, self.rounds // ROUNDS_A_POOL]).random(len(self._classes), np.float32)
         chance = self._kept.astype(np.float32)[self._classes]
         fine = self.scene.fine
         surfels = fine.of(np.flatnonzero(self._free & (luck < chance)))
