@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.cloud import PointChunk
-from scanfind.depth import DEPTH_PIXELS, DepthMap, joined_until_spoken
+from scanfind.depth import DEPTH_PIXELS, Beams
 from scanfind.threads import side_by_side
 
 Floats = NDArray[np.float64]
@@ -64,8 +64,8 @@ class MomentGrid:
         self.counts = np.zeros((self._shards, 3), np.int64)
         self._tables = [empty_hash(EMPTY_BLOCKS // self._shards) for _ in range(self._shards)]
         self._held: list[PointChunk] = []
-        self._depths: dict[tuple[float, ...], NDArray[np.float32]] = {}
-        self._looking: tuple[tuple[float, ...], NDArray[np.float32]] | None = None
+        self._beams: dict[tuple[float, ...], Ints] = {}
+        self._looking: tuple[tuple[float, ...], Ints] | None = None
 
     @property
     def unaddressable(self) -> int:
@@ -84,7 +84,7 @@ class MomentGrid:
         has_origin = chunk.origin is not None
         self.signed &= has_origin
         origin = np.zeros(3) if chunk.origin is None else np.asarray(chunk.origin, np.float64)
-        seen = self._ranges_from(origin - self.offset) if has_origin else np.empty((self._shards, 0), np.float32)
+        seen = self._beams_from(origin - self.offset) if has_origin else np.empty((self._shards, 0), np.int64)
         xyz, offset = chunk.xyz, self.offset
         self._in_shards(
             len(chunk),
@@ -111,20 +111,22 @@ class MomentGrid:
                 return
             self._make_room()
 
-    def _ranges_from(self, origin: Floats) -> NDArray[np.float32]:
-        """The nearest range in each direction from a scanner that each shard notes, (shards, pixels)."""
+    def _beams_from(self, origin: Floats) -> Ints:
+        """The nearest beam in each direction from a scanner that each shard notes, (shards, pixels)."""
+        from scanfind.kernels.grid import NO_BEAM
+
         key = tuple(origin.tolist())
         if self._looking is None or self._looking[0] != key:
             self._look_away()
-            self._looking = key, np.full((self._shards, 6 * DEPTH_PIXELS**2), np.inf, np.float32)
+            self._looking = key, np.full((self._shards, 6 * DEPTH_PIXELS**2), NO_BEAM)
         return self._looking[1]
 
     def _look_away(self) -> None:
         """Join what the shards noted from the scanner of the last chunk: a map for each of 50 stations is enough."""
         if self._looking is not None:
             key, seen = self._looking
-            ranges = seen.min(axis=0)
-            self._depths[key] = np.minimum(self._depths[key], ranges) if key in self._depths else ranges
+            nearest = seen.min(axis=0)
+            self._beams[key] = np.minimum(self._beams[key], nearest) if key in self._beams else nearest
             self._looking = None
 
     def _settle(self, chunk: PointChunk) -> None:
@@ -191,7 +193,7 @@ class MomentGrid:
         parent.points, parent.signed = self.points, self.signed
         parent.counts[0, 2] = self.counts[0, 2]
         parent.units = 2.0 * self.units
-        parent._depths = self._depths
+        parent._beams = self._beams
         blocks, half = self.blocks(), np.int64(self.units / 2)
         keys, cells = self.block_keys, self.block_rows
         parent._in_shards(
@@ -202,12 +204,10 @@ class MomentGrid:
         )
         return parent
 
-    def depth_maps(self) -> list[DepthMap]:
-        """One for each scanner position, in the order of their coordinates."""
+    def beams(self) -> list[Beams]:
+        """The nearest in each direction from each scanner position, in the order of their coordinates."""
         self.release()
-        return joined_until_spoken(
-            [DepthMap(np.array(key), self._depths[key], DEPTH_PIXELS) for key in sorted(self._depths)]
-        )
+        return [Beams(np.array(key), self._beams[key], DEPTH_PIXELS) for key in sorted(self._beams)]
 
 
 def room(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:

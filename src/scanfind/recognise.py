@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.detection import Detection, Motion, Refused
+from scanfind.free_space import Limits, caster_of, spoken_of
 from scanfind.pose import Pose
 from scanfind.refine import Refined, icp, shrinking, unobservable
 from scanfind.search import AREA_OF_A_SAMPLE, Hypotheses, Search, model_arrays
@@ -19,7 +20,8 @@ from scanfind.verify import (
     Level,
     distances,
     distinct,
-    gather,
+    gather_rough,
+    gather_support,
     outlines,
     rough_score,
     score,
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from scanfind.library import JointTable
     from scanfind.model import Model
     from scanfind.parameters import Parameters
+    from scanfind.rays import RayCaster
     from scanfind.scene import Scene
     from scanfind.surfels import Surfels
 
@@ -45,6 +48,7 @@ ALL_SAMPLES = 1 << 30
 # Share of the score asked for that the evidence on the coarse surfels must reach: there 400 samples tell the final
 # score of a shop's 96 best poses within 0.2.
 PROMISING = 0.67
+NET_PENALTY = 2.0
 REFUSED_SHOWN = 3  # of each model: what came closest
 
 
@@ -92,6 +96,7 @@ class Recognition:
         self._apart_before, self._apart_after = diameters / 30.0, diameters / 100.0
         self._drawn_in = diameters / 10.0
         self._similar: dict[int, list[Pose]] = {}
+        self._casters: dict[int, RayCaster] = {}
 
     def wants_more(self, seconds: float) -> bool:
         """Is another round worth it: time left, instances wanted, and the chance of having missed one too high?"""
@@ -131,8 +136,9 @@ class Recognition:
 
     def _promising(self, hypotheses: Hypotheses, shown: int) -> NDArray[np.intp]:
         """Those whose evidence on the coarse surfels is not hopeless, and the best `shown` of each model (indices)."""
-        verify, evidence = self.parameters.verify, self._evidence(hypotheses, self._rough)
-        scores = np.array([rough_score(seen, self.blind, verify) for seen in evidence])
+        verify = self.parameters.verify
+        rough = gather_rough(hypotheses, self.scene, self._rough, self.arrays, self.signed, verify, self.jobs)
+        scores = np.array([rough_score(seen, self.blind) for seen in rough])
         kept = scores >= PROMISING * verify.min_score
         for model in np.unique(hypotheses.models):
             theirs = np.flatnonzero(hypotheses.models == model)
@@ -176,27 +182,42 @@ class Recognition:
     def _no_rows(self) -> NDArray[np.bool_]:
         return np.zeros(len(self.scene.fine.sides), np.bool_)
 
-    def _evidence(self, hypotheses: Hypotheses, level: Level, thin: Level | None = None) -> list[Evidence]:
-        verify = self.parameters.verify
-        return gather(hypotheses, self.scene, level, thin, self.arrays, self.signed, verify, self.jobs)
-
     def candidates(self, refined: Refined) -> list[Candidate]:
         """Refined poses with their evidence."""
-        verify = self.parameters.verify
-        self._fit_near(refined.hypotheses, ceil(verify.gate_cells))
-        evidence = self._evidence(refined.hypotheses, self._fine, self._thin)
+        self._fit_near(refined.hypotheses, ceil(self.parameters.verify.gate_cells))
         found = []
-        for k, seen in enumerate(evidence):
+        for k, seen in enumerate(self._evidence(refined.hypotheses)):
             number = int(refined.hypotheses.models[k])
-            model = self.models[number]
-            net = seen.telling - verify.penalty_weight * seen.penalty()
+            # What a pose explains of the scene, in samples; what beams passed through counts double.
+            net = (seen.telling - NET_PENALTY * seen.penalty()) * seen.samples
             found.append(
                 Candidate(
                     number, refined.hypotheses.rotations[k], refined.hypotheses.translations[k], refined.hessians[k],
-                    seen, score(seen, self.blind, verify), net * seen.samples * AREA_OF_A_SAMPLE * model.spacing**2,
+                    seen, score(seen, self.blind, self.parameters.verify),
+                    net * AREA_OF_A_SAMPLE * self.models[number].spacing ** 2,
                 )
             )  # fmt: skip
         return found
+
+    def _evidence(self, hypotheses: Hypotheses) -> list[Evidence]:
+        """What surfels and beams say of poses near which the fine surfels are fitted."""
+        verify, level = self.parameters.verify, self._fine
+        limits = Limits(level.inlier, level.margin(verify), verify.least_facing)
+        support = gather_support(
+            hypotheses, self.scene, level, self._thin, self.arrays, self.signed, verify, self.jobs
+        )  # fmt: skip
+        found = []
+        for seen, number, rotation, translation in zip(support, *hypotheses[:3], strict=True):
+            model, placed = self.models[number], Pose(rotation, translation)
+            spoken = spoken_of(model, self._caster(number), placed, self.scene.beams, limits)
+            found.append(Evidence(*seen[:-1], spoken, seen.claims))
+        return found
+
+    def _caster(self, number: int) -> RayCaster:
+        """The surface of a model, made ready for beams when first asked for."""
+        if number not in self._casters:
+            self._casters[number] = caster_of(self.models[number])
+        return self._casters[number]
 
     def believe(self, hypotheses: Hypotheses, refined: Refined) -> None:
         """Accept what the evidence carries; of poses that claim one surface, the one that explains most of it.
