@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 
 # A symmetry brings this share of so many samples this near to the surface, in spacings of the samples (3,000 on a spool
 # of 3 m: 2.4 mm; a pipe of 0.1 m drawn with 48 sides is flat by 0.2 mm). A piece of scan has noise, and no faces.
-TRUE_SHARE, TRUE_TRIED = 0.99, 1500
+TRUE_SHARE, TRUE_SHARE_CLOUD, TRUE_TRIED = 0.99, 0.94, 1500
 TRUE_WITHIN, TRUE_WITHIN_CLOUD = 0.1, 0.3
 # … and most of the samples near samples: a face that nobody sees is no part of the surface, nor is the other side of a
 # sheet. Not more of them, for the walls of bolt holes hold too few samples to have one of like normal everywhere.
@@ -77,7 +77,7 @@ class SelfSimilarity:
 
     def __init__(self, surface: ModelSurface, mesh: Mesh | None) -> None:
         self.points, self.normals = surface.samples.points, surface.samples.normals
-        self.spacing, self.diameter = surface.spacing, surface.diameter
+        self.spacing, self.diameter, self.signed = surface.spacing, surface.diameter, surface.signed
         self._reach = ROUGH_WITHIN * surface.spacing
         if mesh is None:
             self._near = near_samples(surface.samples, surface.spacing, self._reach)
@@ -87,6 +87,7 @@ class SelfSimilarity:
             self._near = near_triangles(triangles, self._reach, signed=False)
             self._corners, self._faces = triangles[:, 0], unit_normals(triangles)
         self._within = surface.spacing * (TRUE_WITHIN_CLOUD if mesh is None else TRUE_WITHIN)
+        self._share = TRUE_SHARE_CLOUD if mesh is None else TRUE_SHARE
         # What no symmetry moves: the middle of the surface. That of the samples is it nearly, that of the triangles
         # exactly, unless many of them are hidden.
         self.centre: Floats = self.points.mean(axis=0)
@@ -116,13 +117,15 @@ class SelfSimilarity:
 
         count = min(count, len(self.points))
         rotation, translation = np.ascontiguousarray(motion.rotation), motion.translation
-        return float(self_overlap(self.points, self.normals, count, rotation, translation, 2.0 * self.spacing))
+        return float(
+            self_overlap(self.points, self.normals, self.signed, count, rotation, translation, 2.0 * self.spacing)
+        )
 
     def is_symmetry(self, motion: Pose) -> bool:
         """Does a motion bring the surface onto itself?"""
-        if np.mean(self.off(motion, OVERLAP_SAMPLES) <= self._within) < TRUE_SHARE - 0.03:
+        if np.mean(self.off(motion, OVERLAP_SAMPLES) <= self._within) < self._share - 0.03:
             return False  # most fail here, at a fifteenth of the cost
-        if np.mean(self.off(motion, TRUE_TRIED) <= self._within) < TRUE_SHARE:
+        if np.mean(self.off(motion, TRUE_TRIED) <= self._within) < self._share:
             return False
         return self.overlap(motion, 2 * OVERLAP_SAMPLES) >= TRUE_SAMPLES
 
@@ -317,7 +320,7 @@ class SelfSimilarity:
         cell = SHIFT_CELLS * self.spacing * np.sqrt(len(self.points) / count)
         reach = np.ceil(np.ptp(points, axis=0) / cell).astype(np.int64) + 1
         table = np.zeros(2 * reach + 1, np.int64)
-        count_shifts(points, normals, 1.0 / cell, reach, table)
+        count_shifts(points, normals, self.signed, 1.0 / cell, reach, table)
         around = np.pad(table, 1)
         neighbours = [
             around[tuple(slice(1 + d, 1 + d + size) for d, size in zip(step, table.shape, strict=True))]

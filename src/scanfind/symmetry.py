@@ -20,14 +20,17 @@ from scanfind.pose import Pose, rotation_from_vector
 
 Floats = NDArray[np.float64]
 
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 FREE = 0  # the order of an axis of revolution
 LARGEST_ORDER = 60
 SAME = 1e-6  # rotations whose matrices differ by less are one; those of a group differ by more than 0.1
 PARALLEL = 1e-6  # directions whose cross product is shorter are one
 OWN_AXIS = np.cos(np.radians(0.5))  # nearer to a coordinate axis than this and an axis is called by its name
-# Of equivalent poses the one nearest to this rotation, 3° off none, is reported. It is not none itself, because parts
-# that stand square to the axes are often as far from none one way round as the other. Half the pitch of LARGEST_ORDER.
-REFERENCE = rotation_from_vector([0.016, 0.027, 0.041])
+# Of poses that look the same the one nearest to a reference is reported. It leads to the pose as drawn but is not it:
+# parts stand square to the axes, or upside down, and are then as far from it one way round as the other. It leans by
+# half a radian across the axis of the highest order, and rolls about it by less than half the pitch of LARGEST_ORDER.
+LEANING = rotation_from_vector([0.3, 0.2, 0.35])
+ROLLED = 0.04
 ROLLS = 24  # a free axis in steps; half of one moves the end of a diameter by a fifteenth of it
 
 
@@ -105,20 +108,25 @@ class Symmetry:
     def canonical(self, pose: Pose) -> Pose:
         """Of the poses that look the same as target_from_model, one: which, does not depend on the one given.
 
-        It is the one whose rotation is nearest to `REFERENCE`; a part that stands as it was drawn stays so. A sphere is
-        not turned at all.
+        A part that stands as it was drawn stays so; a sphere is not turned at all. Otherwise it is the one nearest to a
+        rotation somewhat off none, see `LEANING`.
         """
         if self.sphere:
             return pose @ self._about_centre(pose.rotation.T)
-        turns, nearest_to = self.turns, REFERENCE
-        if len(self.free):
-            # A reference that rolled about the free axis would roll a part that stands as drawn.
-            nearest_to = REFERENCE @ turn_about(self.free[0], -roll_of(REFERENCE, self.free[0]))
-            relative = [nearest_to.T @ pose.rotation @ turn for turn in turns]
-            rolls = [turn_about(self.free[0], -roll_of(rotation, self.free[0])) for rotation in relative]
-            turns = np.array([turn @ roll for turn, roll in zip(turns, rolls, strict=True)])
-        near = np.einsum("ij,ik,gkj->g", nearest_to, pose.rotation, turns)
+        reference, turns = self._reference, self.turns
+        for axis in self.free[:1]:
+            rolls = [roll_of(reference.T @ pose.rotation @ turn, axis) for turn in turns]
+            turns = np.array([turn @ turn_about(axis, -roll) for turn, roll in zip(turns, rolls, strict=True)])
+        near = np.einsum("ij,ik,gkj->g", reference, pose.rotation, turns)
         return pose @ self._about_centre(turns[int(np.argmax(near))])
+
+    @cached_property
+    def _reference(self) -> Floats:
+        """The rotation (3, 3) that reported ones are nearest to; about a free axis it does not roll."""
+        main = max(self.axes, key=lambda axis: axis.order or np.inf, default=Axis(AXES["z"], FREE))
+        axis = np.array(main.direction)
+        roll = 0.0 if main.order == FREE else ROLLED
+        return LEANING @ turn_about(axis, roll - roll_of(LEANING, axis))
 
     def moved(self, target_from_model: Pose) -> Symmetry:
         """The symmetry of the model where a pose puts it."""
@@ -166,7 +174,7 @@ def parse_axes(text: str) -> tuple[Axis, ...]:
     words = [word.strip() for word in text.lower().split(",")]
     if words == ["none"]:
         return ()
-    read = [re.fullmatch(r"([xyz])(\*|\d{1,3})", word) for word in words]
+    read = [re.fullmatch(r"([xyz])(\*|[1-9]\d?)", word) for word in words]
     if not all(read):
         msg = (
             f'a symmetry is axes of the model with their order, such as "x2", "z4,x2" or "z*", or "none", got {text!r}'
@@ -175,9 +183,6 @@ def parse_axes(text: str) -> tuple[Axis, ...]:
     axes = tuple(Axis(AXES[word[1]], FREE if word[2] == "*" else int(word[2])) for word in read if word is not None)
     Symmetry(np.zeros(3), axes)
     return axes
-
-
-AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 def turn_about(direction: Floats | tuple[float, float, float], angle: float) -> Floats:
