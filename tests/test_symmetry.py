@@ -142,7 +142,7 @@ def test_what_stands_square_is_reported_alike_whatever_the_noise(axes: str, quar
     [
         ("none", "none"),
         ("x2", "2-fold about x"),
-        ("x2, Y2, z2", "2-fold about x and y and z"),
+        ("x2, Y2, z2", "2-fold about x, y and z"),
         ("z4,x2", "4-fold about z; 2-fold about x"),
         ("x*", "free to roll about x"),
         ("z*,x2", "free to roll about z; 2-fold about x"),

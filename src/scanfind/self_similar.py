@@ -282,7 +282,9 @@ class SelfSimilarity:
     def _turned(self) -> Iterator[Pose]:
         """Turns of a cube along the model's own axes, those of its largest plane faces, and its principal ones."""
         principal = np.linalg.svd(self.points - self.centre, full_matrices=False)[2]
-        for axes in (np.eye(3), self._faced(), principal):
+        faced = self._faced()
+        square = (np.abs(faced) > APART).any(axis=1).all()  # to the model's own axes
+        for axes in (np.eye(3), principal) if square else (np.eye(3), faced, principal):
             axes[2] = np.cross(axes[0], axes[1])
             along = self.points @ axes.T
             middle = 0.5 * (along.min(axis=0) + along.max(axis=0)) @ axes
@@ -305,9 +307,11 @@ class SelfSimilarity:
         """
         for shift in self._shifts():
             here, step = self.overlap(shifted(shift)), SHIFT_FLANK * self.spacing
+            if here < LEAST_OVERLAP:
+                continue
             ends = [self.overlap(shifted(shift + side * step * unit(shift))) for side in (-1, 1)]
             aside = (self.overlap(shifted(shift + side * step * axis)) for axis in np.eye(3) for side in (-1, 1))
-            if here >= LEAST_OVERLAP and max(ends) < SHIFT_DIP * here and all(each <= here for each in aside):
+            if max(ends) < SHIFT_DIP * here and all(each <= here for each in aside):
                 yield shifted(shift)
                 yield shifted(-shift)
 

@@ -141,10 +141,7 @@ class Symmetry:
         told: dict[int, list[str]] = {}
         for axis in self.axes:
             told.setdefault(axis.order, []).append(_called(axis.direction))
-        whats = [
-            (f"{order}-fold about " if order else "free to roll about ") + " and ".join(names)
-            for order, names in told.items()
-        ]
+        whats = [(f"{order}-fold" if order else "free to roll") + f" about {_listed(told[order])}" for order in told]
         return "; ".join(whats) or "none"
 
     def _about_centre(self, turn: Floats) -> Pose:
@@ -195,6 +192,11 @@ def roll_of(rotation: Floats, axis: Floats) -> float:
     quaternion = Pose(rotation, np.zeros(3)).quaternion()
     along = float(axis @ [quaternion[part] for part in "xyz"])
     return 2.0 * float(np.arctan2(along, quaternion["w"]))
+
+
+def _listed(names: list[str]) -> str:
+    *first, last = sorted(names)
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _called(direction: tuple[float, float, float]) -> str:
