@@ -19,9 +19,10 @@ import scanfind
 from scanfind.cloud import CloudModel
 from scanfind.cloud_surface import sample_cloud
 from scanfind.mesh import Mesh
+from scanfind.onto_itself import OntoItself
 from scanfind.pose import Pose
-from scanfind.self_similar import SelfSimilarity
 from scanfind.surface import SurfaceParameters, sample_mesh
+from scanfind.symmetries import find_symmetry
 from scanfind.symmetry import Symmetry
 from scanfind.threads import available_cores
 
@@ -59,9 +60,10 @@ def symmetry_of(model: Mesh | CloudModel) -> Symmetry:
     An origin far from the model would turn degrees into millimetres.
     """
     if isinstance(model, Mesh):
-        found = SelfSimilarity(sample_mesh(model, SurfaceParameters()), model).symmetry()
+        itself = OntoItself(sample_mesh(model, SurfaceParameters()), model)
     else:
-        found = SelfSimilarity(sample_cloud(model, SurfaceParameters()), None).symmetry()
+        itself = OntoItself(sample_cloud(model, SurfaceParameters()), None)
+    found = find_symmetry(itself)
     points = model.vertices if isinstance(model, Mesh) else model.points
     return found if found.axes else Symmetry(centre_of(points))
 

@@ -12,9 +12,11 @@ import numpy as np
 from scanfind.cloud import CloudModel, OrientedCloud
 from scanfind.cloud_surface import sample_cloud
 from scanfind.mesh import Mesh, Placement
+from scanfind.onto_itself import OntoItself
 from scanfind.pairs import PairParameters, PairTable, build_pairs
-from scanfind.self_similar import SelfSimilarity, Similar
+from scanfind.self_similar import Similar, find_similar
 from scanfind.surface import SurfaceParameters, sample_mesh
+from scanfind.symmetries import declared_symmetry, find_symmetry
 from scanfind.symmetry import Symmetry, parse_axes
 
 # Part of every model's hash: raise it when the samples or pairs of one and the same model come out differently.
@@ -112,9 +114,9 @@ def build_model(model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS
     else:
         surface = sample_cloud(model, parameters.surface)
         mesh, cloud = None, model
-    itself = SelfSimilarity(surface, mesh)
+    itself = OntoItself(surface, mesh)
     declared = parameters.symmetry
-    symmetry = itself.symmetry() if declared is None else itself.declared(parse_axes(declared))
+    symmetry = find_symmetry(itself) if declared is None else declared_symmetry(itself, parse_axes(declared))
     return Model(
         name=model.name,
         sha256=model_hash(model, parameters),
@@ -127,7 +129,7 @@ def build_model(model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS
         cloud=cloud,
         pairs=build_pairs(surface.samples, surface.diameter, surface.spacing, parameters.pairs),
         symmetry=symmetry,
-        similar=itself.similar(symmetry),
+        similar=find_similar(itself, symmetry),
         placements=mesh.placements if mesh else (),
         parameters=parameters,
     )
