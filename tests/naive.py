@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from itertools import product
+from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.pose import Pose
+
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 
 def kabsch(source: Floats, target: Floats) -> tuple[Floats, Floats]:
@@ -67,3 +70,21 @@ def nearest(
     far[(alike < cosine) | (far >= gate)] = np.inf
     best = int(far.argmin())
     return best if far[best] < np.inf else -1
+
+
+def self_overlap(points: Floats, normals: Floats, signed: bool, some: int, pose: Pose, reach: float) -> float:
+    """Share of the first `some` samples (N, 3) that a motion brings near a sample with a like normal."""
+    apart = np.linalg.norm(pose.move(points[:some])[:, None] - points[None], axis=2)
+    along = pose.turn(normals[:some]) @ normals.T
+    like = (along if signed else np.abs(along)) > 0.7
+    return float(((apart <= reach) & like).any(axis=1).mean())
+
+
+def shift_table(points: Floats, normals: Floats, signed: bool, per_metre: float, reach: Ints) -> Ints:
+    """How often each shift, in cells about the middle of the table, leads from a sample to one of like normal."""
+    table = np.zeros(2 * reach + 1, np.int64)
+    for i, j in permutations(range(len(points)), 2):
+        along = float(normals[i] @ normals[j])
+        if (along if signed else abs(along)) > 0.9:
+            table[tuple(reach + np.round((points[i] - points[j]) * per_metre).astype(np.int64))] += 1
+    return table
