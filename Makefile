@@ -14,7 +14,7 @@ SEEDS ?= 5000-5019
 QUICK ?= paper-quick
 SOURCES := $(shell find src -name '*.py')
 # An index out of bounds corrupts silently in compiled code: these run once with every access checked.
-KERNEL_TESTS := $(wildcard $(foreach stage,near_surface isolate surface pairs surfels search verify refine scene,\
+KERNEL_TESTS := $(wildcard $(foreach stage,near_surface isolate surface pairs surfels search verify refine scene onto_itself,\
 	tests/test_$(stage)*.py))
 
 # What neither starts a child process for each model nor compiles the search.

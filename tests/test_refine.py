@@ -25,7 +25,6 @@ from scanfind.simulate.parts import blocks, pipe
 from scanfind.simulate.placement import surface_points
 from scanfind.surface import SurfaceParameters
 from scanfind.surfels import Surfels
-from scanfind.symmetry import self_similar
 
 Floats = NDArray[np.float64]
 
@@ -211,34 +210,3 @@ def test_marked_are_the_cells_of_a_cube_about_each_point(seed: int, reach: int, 
 
 
 # ── self-similar poses ──
-
-
-def test_a_box_is_itself_after_three_half_turns() -> None:
-    model = model_of(blocks("box", [((0, 0, 0), (1.0, 0.7, 0.4))]))
-    found = [pose for pose in self_similar(model) if overlap(model, pose) > 0.9]
-    halves = [np.diag(d) for d in ([1.0, -1, -1], [-1.0, 1, -1], [-1.0, -1, 1])]
-    for half in halves:
-        middle = np.array([0.5, 0.35, 0.2])
-        expected = Pose(half, middle - half @ middle)
-        assert min(pose.difference(expected)[0] + pose.difference(expected)[1] for pose in found) < 0.02
-    assert len(found) == 3
-
-
-def test_a_cube_is_itself_after_all_turns_but_none() -> None:
-    model = model_of(blocks("cube", [((0, 0, 0), (0.5, 0.5, 0.5))]))
-    found = self_similar(model)
-    assert len([pose for pose in found if overlap(model, pose) > 0.9]) == 23
-    assert all(pose.difference(Pose.identity())[1] > 0.05 for pose in found)
-    assert len(self_similar(model, most=5)) == 5
-
-
-def test_an_irregular_body_is_itself_after_no_turn() -> None:
-    model = model_of(BRACKET)
-    assert all(overlap(model, pose) < 0.8 for pose in self_similar(model))
-
-
-def overlap(model: Model, pose: Pose) -> float:
-    """Share of samples that a motion brings near a sample with a like normal: all against all."""
-    points, normals = pose.move(model.samples.points), pose.turn(model.samples.normals)
-    apart = np.linalg.norm(points[:, None] - model.samples.points[None], axis=2)
-    return float(((apart <= 2 * model.spacing) & (normals @ model.samples.normals.T > 0.7)).any(axis=1).mean())

@@ -27,7 +27,7 @@ from scanfind.scans import read_scan
 PROMISED = {
     "": "schema scanfind seed parameters shift_m crs scans models detections refused timings_s peak_memory_bytes",
     "scans": "path points dropped stations_m",
-    "models": "name sha256 diameter_m pairs",
+    "models": "name sha256 diameter_m pairs symmetry",
     "detections": "id model scene_from_model translation_m quaternion score support visible_support penalty coverage "
     "rms_m unobservable points isolated",
     "timings_s": "read grid search verify refine isolate write total",
@@ -113,6 +113,10 @@ def test_results_json_keeps_the_promised_schema(tmp_path: Path, findings: Findin
     assert results["scans"][0]["stations_m"] == [[1.0, 2.0, 3.0], None]
     assert results["refused"][0]["penalty"] is None
     assert {model["name"]: model["pairs"] > 0 for model in results["models"]} == {"Rohr Ø 168/4": True, "frame": True}
+    for model, summary in zip(results["models"], models.show(), strict=True):
+        assert model["symmetry"]["words"] == summary.symmetry.words()
+        assert [axis["order"] or 0 for axis in model["symmetry"]["axes"]] == [a.order for a in summary.symmetry.axes]
+        assert model["symmetry"]["centre_m"] == summary.symmetry.centre.tolist()
     assert results["timings_s"]["total"] == pytest.approx(4.0 + results["timings_s"]["write"])
     assert results["peak_memory_bytes"] > 1_000_000
     for entry, found in zip(results["detections"], findings, strict=True):

@@ -120,8 +120,8 @@ def test_chunks_and_order_change_nothing(cuts: list[int], seed: int) -> None:
     pieces = grid_of([chunk(part) for part in np.split(shuffled, sorted(cuts))])
     assert_same_moments(whole, pieces)
     assert_equal(fitted(whole), fitted(pieces))
-    for one, other in zip(whole.depth_maps(), pieces.depth_maps(), strict=True):
-        np.testing.assert_array_equal(one.ranges, other.ranges)
+    for one, other in zip(whole.beams(), pieces.beams(), strict=True):
+        np.testing.assert_array_equal(one.nearest, other.nearest)
 
 
 @pytest.mark.parametrize("jobs", [1, 3])
@@ -147,9 +147,9 @@ def test_threads_that_share_a_pass_change_nothing(jobs: int) -> None:
     assert_same_moments(alone, together)
     assert_same_moments(alone.coarser().coarser(), together.coarser().coarser())
     assert_equal(fitted(alone), fitted(together, jobs=jobs))
-    for one, two in zip(alone.depth_maps(), together.depth_maps(), strict=True):
+    for one, two in zip(alone.beams(), together.beams(), strict=True):
         np.testing.assert_array_equal(one.origin, two.origin)
-        np.testing.assert_array_equal(one.ranges, two.ranges)
+        np.testing.assert_array_equal(one.nearest, two.nearest)
 
 
 @settings(deadline=None, max_examples=20)
@@ -213,7 +213,7 @@ def test_a_scan_far_away_gives_the_same_surfels(far: tuple[int, int, int]) -> No
     one, other = fitted(here), fitted(there)
     np.testing.assert_array_equal(other.cells.offset - one.cells.offset, shift)
     assert_equal(one, other)
-    np.testing.assert_array_equal(here.depth_maps()[0].ranges, there.depth_maps()[0].ranges)
+    np.testing.assert_array_equal(here.beams()[0].nearest, there.beams()[0].nearest)
 
 
 # ── surfels ──
@@ -300,7 +300,7 @@ def test_without_a_scanner_normals_have_no_side() -> None:
     assert not fitted(grid_of([chunk(points, None)])).signed
     mixed = grid_of([chunk(points), chunk(points, None)])
     assert not fitted(mixed).signed
-    assert len(mixed.depth_maps()) == 1
+    assert len(mixed.beams()) == 1
 
 
 def plate(count: int, thickness: float, turn: Floats) -> tuple[Floats, Floats]:

@@ -20,6 +20,7 @@ from scanfind.pose import Pose
 
 if TYPE_CHECKING:
     from scanfind.library import ModelLibrary
+    from scanfind.symmetry import Symmetry
 
 # Both ends of a file and its length: a GB is told apart from another in milliseconds, not in seconds.
 FINGERPRINT_BLOCK = 1 << 20
@@ -85,9 +86,24 @@ def findings_of(results: schema.Results) -> Findings:
 def model_entries(models: ModelLibrary) -> list[schema.ModelEntry]:
     """What a library holds, as results.json has it."""
     return [
-        schema.ModelEntry(name=model.name, sha256=model.sha256, diameter_m=model.diameter, pairs=model.pairs)
+        schema.ModelEntry(
+            name=model.name,
+            sha256=model.sha256,
+            diameter_m=model.diameter,
+            pairs=model.pairs,
+            symmetry=symmetry_entry(model.symmetry),
+        )
         for model in models.show()
     ]
+
+
+def symmetry_entry(symmetry: Symmetry) -> schema.SymmetryEntry:
+    """A model's symmetry, as results.json has it."""
+    return schema.SymmetryEntry(
+        words=symmetry.words(),
+        centre_m=_vector(symmetry.centre),
+        axes=[schema.AxisEntry(direction=axis.direction, order=axis.order or None) for axis in symmetry.axes],
+    )
 
 
 def fingerprint(path: Path) -> str | None:

@@ -118,7 +118,8 @@ def towards(model: Model, placed: Pose, scanners: Sequence[Beams]) -> Towards:
         asked = some[lots(some) < share]
         directions, ranges, angles = np.empty((len(asked), 3)), np.empty(len(asked)), np.empty(len(asked))
         beams_of(asked, scanner.nearest, scanner.edge, directions, ranges, angles)
-        found.append(Towards(np.broadcast_to(scanner.origin, directions.shape), directions, ranges, angles))
+        # Each of those asked stands for as many as were left out.
+        found.append(Towards(np.broadcast_to(scanner.origin, directions.shape), directions, ranges, angles / share))
     return Towards(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 

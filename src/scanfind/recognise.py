@@ -14,7 +14,6 @@ from scanfind.free_space import Limits, caster_of, spoken_of
 from scanfind.pose import Pose
 from scanfind.refine import Refined, icp, shrinking, unobservable
 from scanfind.search import AREA_OF_A_SAMPLE, Hypotheses, Search, model_arrays
-from scanfind.symmetry import self_similar
 from scanfind.verify import (
     Evidence,
     Level,
@@ -95,7 +94,6 @@ class Recognition:
         # Poses closer than a thirtieth of the diameter meet in one ICP; after it a hundredth tells them apart.
         self._apart_before, self._apart_after = diameters / 30.0, diameters / 100.0
         self._drawn_in = diameters / 10.0
-        self._similar: dict[int, list[Pose]] = {}
         self._casters: dict[int, RayCaster] = {}
 
     def wants_more(self, seconds: float) -> bool:
@@ -279,9 +277,10 @@ class Recognition:
         mark_rows(at.order, layers, at.block_rows, marked)
 
     def _hits(self, hypotheses: Hypotheses, found: Candidate) -> int:
-        """How many of a round's hypotheses lead to a pose, or to one it is turned onto by the model's symmetry."""
-        placed = Pose(found.rotation, found.translation)
-        poses = [placed, *(placed @ motion for motion in self._similar.get(found.model, []))]
+        """How many of a round's hypotheses lead to a pose, or to one that looks the same or could be taken for it."""
+        placed, model = Pose(found.rotation, found.translation), self.models[found.model]
+        motions = [*model.symmetry.motions(), *self._similar(found.model)]
+        poses = [placed @ motion for motion in motions]
         theirs = outlines(self._placements(found.model, poses), self.arrays)
         mine = outlines(hypotheses.take(np.flatnonzero(hypotheses.models == found.model)), self.arrays)
         return sum(bool((distances(one, theirs) < self._drawn_in[found.model]).any()) for one in mine)
@@ -299,15 +298,15 @@ class Recognition:
         claims = self.scene.fine.cells.rows[self.scene.fine.cell_of[candidate.evidence.claims]]
         return bool(claimed[claims].mean() > self.parameters.verify.shared) if len(claims) else True
 
+    def _similar(self, model: int) -> list[Pose]:
+        """The motions after which a model could be taken for itself. True symmetries are not tried: nothing tells."""
+        return [each.motion for each in self.models[model].similar[: self.parameters.verify.alternatives]]
+
     def _best_of_similar(self, candidate: Candidate) -> Candidate:
         """The best of a pose and those it could be taken for: the model turned over onto itself, each refined again."""
-        if not self.parameters.verify.alternatives:
-            return candidate
         number = candidate.model
-        if number not in self._similar:
-            self._similar[number] = self_similar(self.models[number], self.parameters.verify.alternatives)
         placed = Pose(candidate.rotation, candidate.translation)
-        others = [placed @ motion for motion in self._similar[number]]
+        others = [placed @ motion for motion in self._similar(number)]
         if not others:
             return candidate
         turned = self._placements(number, others)
@@ -332,12 +331,14 @@ class Recognition:
         )  # fmt: skip
 
     def _pose(self, found: Candidate) -> Pose:
-        return Pose(found.rotation, found.translation + self.scene.fine.cells.offset)
+        """In the scans' own frame; of the poses that look the same always one, however it was come by."""
+        pose = Pose(found.rotation, found.translation + self.scene.fine.cells.offset)
+        return self.models[found.model].symmetry.canonical(pose)
 
     def _unobservable(self, found: Candidate) -> tuple[Motion, ...]:
         """In the model's own axes."""
         turn = np.zeros((6, 6))
-        turn[:3, :3] = turn[3:, 3:] = found.rotation
+        turn[:3, :3] = turn[3:, 3:] = self._pose(found).rotation
         centre, radius = self.arrays.centres[found.model], float(self.arrays.radii[found.model])
         return unobservable(turn.T @ found.hessian @ turn, centre, radius, self.parameters.refine.unobservable_below)
 

@@ -36,13 +36,36 @@ class ScanEntry(Entry):
     fingerprint: str | None = None
 
 
+class AxisEntry(Entry):
+    """A unit direction of the model's frame, and the order of the turns about it: n for 2π/n, null for every angle."""
+
+    direction: Vector
+    order: int | None
+
+
+class SymmetryEntry(Entry):
+    """The rotations that map a model onto itself: those about these axes through `centre_m`, in any succession.
+
+    No axis: none. Two of order null: every rotation, as of a sphere. Of poses that look the same the one reported is
+    nearest to the model standing as it was drawn. `words` says it for people.
+    """
+
+    words: str
+    centre_m: Vector
+    axes: list[AxisEntry]
+
+
 class ModelEntry(Entry):
-    """A model that was sought. `sha256`: of its geometry and of the parameters it was prepared with."""
+    """A model that was sought. `sha256`: of its geometry and of the parameters it was prepared with.
+
+    `symmetry` is null in results of scanfind before it knew of it.
+    """
 
     name: str
     sha256: str
     diameter_m: float
     pairs: int
+    symmetry: SymmetryEntry | None = None
 
 
 class Quaternion(Entry):
