@@ -1,0 +1,227 @@
+"""The last fit: a pose on its own raw points, and how uncertain it is (decisions/0012-what-the-data-fix.md).
+
+The isolated points are held against the model's exact surface. What counts as one measurement is not a point but a
+patch: points a scanner saw of one small piece of surface, of one side, share whatever is wrong there (a dent, an edge,
+a mixed pixel), so a patch is as uncertain as the mean of its points and, on top, as patches are found to disagree.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.detection import Motion
+from scanfind.kernels.distance import distances
+from scanfind.pose import Pose, rotation_from_vector
+from scanfind.refine import RefineParameters, motion_of
+from scanfind.threads import in_threads
+
+if TYPE_CHECKING:
+    from scanfind.kernels.distance import NearSurface
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Of a scan of 10 M points a spool has 100,000: every further one costs 3 µs and what it tells is lost in what patches
+# disagree.
+MOST_POINTS = 50_000
+PATCHES_ACROSS = 72.0  # along the diameter: 5 cm of a spool of 3.6 m
+# Points farther off than so many times the noise are something else's. At three the gate itself made errors a third
+# larger than told.
+GATE_NOISES = 4.0
+# How many points of the whole a group's noise is averaged with, so that a group of three has one.
+PRIOR_POINTS = 12.0
+LEAST_NOISE = 1e-6  # of the diameter: exact points still have a rounding
+TUKEY = 4.685  # patches off by more sigmas count for nothing; 95 % as efficient as least squares on clean ones
+REWEIGHTINGS = 6
+LEAST_PATCHES = 12  # twice the unknowns
+
+
+class Polished(NamedTuple):
+    """A pose fitted to raw points.
+
+    covariance : (6, 6) of (rotation, translation), scene axes, rad and m, about the pivot: zero along the motions of
+        `unobservable` that have no sigma
+    pivot : (3,) scene frame, metres: the middle of the model's box, placed
+    unobservable : motions the data do not fix, or fix to no better than one point's noise
+    """
+
+    scene_from_model: Pose
+    covariance: Floats
+    pivot: Floats
+    unobservable: tuple[Motion, ...]
+
+
+class Touching(NamedTuple):
+    """K points on faces of the placed model, in the model's frame.
+
+    points, normals : (K, 3) metres, and of their faces; off : (K,) from the face's plane, metres
+    group : (K,) numbers points of one scan on faces that look the same way, which have about the same noise
+    """
+
+    points: Floats
+    normals: Floats
+    off: Floats
+    group: Ints
+
+
+class Patches(NamedTuple):
+    """P means of the points on a patch each.
+
+    rows : (P, 6) how far the surface goes along its normal with each motion (rotation × radius, translation)
+    off : (P,) of the points from the surface, metres; variance : (P,) of that by noise alone
+    """
+
+    rows: Floats
+    off: Floats
+    variance: Floats
+
+
+def polish(
+    near: NearSurface, pose: Pose, xyz: Floats, scan_id: NDArray[np.integer], parameters: RefineParameters, jobs: int = 1
+) -> Polished | None:
+    """Fit a pose to raw points of its model; None where fewer than `LEAST_PATCHES` patches are seen.
+
+    near : the model's surface; a point within its reach may count
+    pose : scene_from_model, within the noise of the right one
+    xyz : (N, 3) the isolated points, scene frame; scan_id : (N,) whose they are
+    """
+    some = slice(None, None, max(1, -(-len(xyz) // MOST_POINTS)))
+    xyz, scan_id = np.ascontiguousarray(xyz[some]), scan_id[some]
+    low, high = near.boxes[1].reshape(2, 3)
+    centre, size = 0.5 * (low + high), float(np.linalg.norm(high - low))
+    radius = 0.5 * size
+    for _ in range(parameters.raw_steps):
+        on = touching(near, pose, xyz, scan_id, jobs)
+        patches = patches_of(on, centre, radius, size / PATCHES_ACROSS, LEAST_NOISE * size)
+        if len(patches.off) < LEAST_PATCHES:
+            return None
+        step, covariance, free = solved(patches, parameters.unobservable_below)
+        turned = rotation_from_vector(step[:3] / radius)
+        # In the model's frame, about its centre: the true pose is pose @ motion.
+        pose = pose @ Pose(turned, centre - turned @ centre + step[3:])
+    variances, vectors = np.linalg.eigh(covariance)
+    noise = float(np.mean(on.off**2))
+    loose = [motion_of(motion, centre, radius) for motion in free.T] + [
+        motion_of(vector, centre, radius, sqrt(variance))
+        for variance, vector in zip(variances, vectors.T, strict=True)
+        if variance > noise
+    ]
+    return Polished(pose, in_scene(covariance, pose, radius), pose.move(centre[None])[0], tuple(loose))
+
+
+def touching(near: NearSurface, pose: Pose, xyz: Floats, scan_id: NDArray[np.integer], jobs: int) -> Touching:
+    """Those of N points (N, 3) whose nearest point of the placed model lies within a face, not on an edge."""
+    shift, every = np.zeros(3), np.arange(len(xyz))
+    parts = in_threads(
+        jobs, len(xyz), lambda i, j: distances(near, pose.rotation, pose.translation, shift, xyz, every[i:j])
+    )
+    distance, face = (np.concatenate(column) for column in zip(*parts, strict=True))
+    met = np.flatnonzero(face >= 0)
+    row = np.empty(int(near.face.max()) + 1, np.int64)
+    row[near.face] = np.arange(len(near.face))
+    at = row[face[met]]
+    points, normals = pose.inverse().move(xyz[met]), near.normals[at]
+    off = ((points - near.corners[at, 0]) * normals).sum(axis=1)
+    # At an edge the distance is longer than that from the plane; single precision tells 1 µm of it.
+    within = np.abs(np.abs(off) - np.abs(distance[met])) < 1e-6
+    met, points, normals, off = met[within], points[within], normals[within], off[within]
+    facing = np.rint(normals).astype(np.int64)
+    return Touching(points, normals, off, numbered(*facing.T, scan_id[met].astype(np.int64)))
+
+
+def patches_of(on: Touching, centre: Floats, radius: float, patch: float, least_noise: float) -> Patches:
+    """The patches of points: those of one group in one cube of edge `patch`, metres, of the model's frame."""
+    if not len(on.off):
+        return Patches(np.empty((0, 6)), np.empty(0), np.empty(0))
+    noise = np.maximum(noise_of(on.off, on.group), least_noise)
+    kept = np.abs(on.off) < GATE_NOISES * noise
+    points, normals, off, group = (column[kept] for column in on)
+    # Of what the gate leaves: the median alone takes a scan in steps (a Kinect's) for one without noise.
+    variance = np.maximum(averaged(off**2, group), least_noise**2)
+    cube = np.floor(points / patch).astype(np.int64)
+    member = numbered(*cube.T, group)
+    count = np.bincount(member)
+    rows = np.concatenate([np.cross(points - centre, normals) / radius, normals], axis=1)
+    return Patches(
+        np.stack([np.bincount(member, column) / count for column in rows.T], axis=1),
+        np.bincount(member, off) / count,
+        np.bincount(member, variance[group]) / count**2,
+    )
+
+
+def noise_of(off: Floats, group: Ints) -> Floats:
+    """The noise of each of N points by its group, (N,), metres: 1.48 times the median of the absolute distance."""
+    order = np.lexsort((np.abs(off), group))
+    count = np.bincount(group)
+    medians = np.abs(off)[order][np.cumsum(count) - count + count // 2]
+    whole = float(np.median(np.abs(off)))
+    shared = (count * medians**2 + PRIOR_POINTS * whole**2) / (count + PRIOR_POINTS)
+    return np.asarray(1.4826 * np.sqrt(shared)[group])
+
+
+def averaged(values: Floats, group: Ints) -> Floats:
+    """The mean of each group's values, (G,), with `PRIOR_POINTS` of all."""
+    count = np.bincount(group)
+    return np.asarray((np.bincount(group, values) + PRIOR_POINTS * values.mean()) / (count + PRIOR_POINTS))
+
+
+def solved(patches: Patches, below: float) -> tuple[Floats, Floats, Floats]:
+    """The step (6,) to where patches are matched best, its covariance (6, 6), and the motions left open, (6, F).
+
+    below : share of the mean information under which a motion is left open: no step along it, and no covariance
+
+    Tukey's weights over each patch's sigma: its noise, and what all patches disagree by beyond theirs.
+    """
+    values, vectors = np.linalg.eigh((patches.rows / patches.variance[:, None]).T @ patches.rows)
+    free = values <= below * values.mean()
+    fixed = vectors[:, ~free]
+    rows, disagreement = patches.rows @ fixed, 0.0
+    step = np.zeros(rows.shape[1])
+    for _ in range(REWEIGHTINGS):
+        precision = 1.0 / (patches.variance + disagreement)
+        share = (patches.off - rows @ step) ** 2 * precision / TUKEY**2
+        weight = np.where(share < 1.0, (1.0 - share) ** 2, 0.0)
+        weighted = rows * (weight * precision)[:, None]
+        step = np.linalg.solve(weighted.T @ rows, weighted.T @ patches.off)
+        in_use = weight > 0.0
+        disagreement = disagreed((patches.off - rows @ step)[in_use] ** 2, patches.variance[in_use], rows.shape[1])
+    # An M-estimator's covariance: least squares' times E ψ² / (E ψ')² (Huber 1981, 7.6).
+    slope = np.where(share < 1.0, (1.0 - share) * (1.0 - 5.0 * share), 0.0)
+    spread = float(np.mean(weight**2 * share)) * TUKEY**2 / float(slope.mean()) ** 2
+    covariance = np.linalg.inv((rows * precision[:, None]).T @ rows) * spread
+    return fixed @ step, fixed @ covariance @ fixed.T, vectors[:, free]
+
+
+def disagreed(squares: Floats, variance: Floats, unknowns: int) -> float:
+    """The variance that patches have beyond their noise: with it, the squares of what is left are as many as they are
+    degrees of freedom (Paule & Mandel 1982, by bisection).
+    """
+    freedom = len(squares) - unknowns
+    low, high = 0.0, float(squares.max())
+    if float((squares / variance).sum()) <= freedom:
+        return 0.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if float((squares / (variance + middle)).sum()) > freedom else (low, middle)
+    return high
+
+
+def in_scene(covariance: Floats, pose: Pose, radius: float) -> Floats:
+    """From the model's axes and (rotation × radius, translation) to the scene's, radians and metres."""
+    turn = np.zeros((6, 6))
+    turn[:3, :3], turn[3:, 3:] = pose.rotation / radius, pose.rotation
+    found = turn @ covariance @ turn.T
+    return np.asarray(0.5 * (found + found.T))
+
+
+def numbered(*columns: Ints) -> Ints:
+    """Equal rows of some columns (N,) get equal numbers (N,), counted from 0."""
+    packed = np.zeros(len(columns[0]), np.int64)
+    for column in columns:
+        if len(column):
+            packed = packed * (np.ptp(column) + 1) + (column - column.min())
+    return np.asarray(np.unique(packed, return_inverse=True)[1].ravel(), np.int64)
