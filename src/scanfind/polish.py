@@ -8,7 +8,7 @@ a mixed pixel), so a patch is as uncertain as the mean of its points and, on top
 from __future__ import annotations
 
 from dataclasses import replace
-from math import sqrt
+from math import erf, pi, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -34,11 +34,13 @@ PATCHES_ACROSS = 72.0  # along the diameter: 5 cm of a spool of 3.6 m
 # Points farther off than so many times the noise are something else's. At three the gate itself made errors a third
 # larger than told.
 GATE_NOISES = 4.0
+NARROWEST = 1.0  # noises: where less than this is left of the gate, too little can be told from it
 # How many points of the whole a group's noise is averaged with, so that a group of three has one.
 PRIOR_POINTS = 12.0
 LEAST_NOISE = 1e-6  # of the diameter: exact points still have a rounding
 TUKEY = 4.685  # patches off by more sigmas count for nothing; 95 % as efficient as least squares on clean ones
 REWEIGHTINGS = 6
+NOISE_STEPS = 3
 LEAST_PATCHES = 12  # twice the unknowns
 
 
@@ -61,12 +63,14 @@ class Touching(NamedTuple):
     """K points on faces of the placed model, in the model's frame.
 
     points, normals : (K, 3) metres, and of their faces; off : (K,) from the face's plane, metres
+    gate : (K,) metres: a point as far off, on either side, would have been isolated as well
     group : (K,) numbers points of one scan on faces that look the same way, which have about the same noise
     """
 
     points: Floats
     normals: Floats
     off: Floats
+    gate: Floats
     group: Ints
 
 
@@ -98,9 +102,9 @@ def polish(
     xyz, scan_id = np.ascontiguousarray(xyz[some]), scan_id[some]
     low, high = near.boxes[1].reshape(2, 3)
     centre, size = 0.5 * (low + high), float(np.linalg.norm(high - low))
-    radius = 0.5 * size
+    start, radius = pose, 0.5 * size
     for _ in range(parameters.raw_steps):
-        on = touching(near, pose, xyz, scan_id, jobs)
+        on = touching(near, pose, start, xyz, scan_id, jobs)
         patches = patches_of(on, centre, radius, size / PATCHES_ACROSS, LEAST_NOISE * size)
         if len(patches.off) < LEAST_PATCHES:
             return None
@@ -109,7 +113,7 @@ def polish(
         # In the model's frame, about its centre: the true pose is pose @ motion.
         pose = pose @ Pose(turned, centre - turned @ centre + step[3:])
     variances, vectors = np.linalg.eigh(covariance)
-    noise = float(np.mean(on.off**2))
+    noise = float(np.median(on.off**2))
     loose = [motion_of(motion, centre, radius) for motion in free.T] + [
         motion_of(vector, centre, radius, sqrt(variance))
         for variance, vector in zip(variances, vectors.T, strict=True)
@@ -150,8 +154,13 @@ def measured(near: NearSurface, pose: Pose, xyz: Floats, jobs: int) -> tuple[NDA
     return distance, face
 
 
-def touching(near: NearSurface, pose: Pose, xyz: Floats, scan_id: NDArray[np.integer], jobs: int) -> Touching:
-    """Those of N points (N, 3) whose nearest point of the placed model lies within a face, not on an edge."""
+def touching(
+    near: NearSurface, pose: Pose, start: Pose, xyz: Floats, scan_id: NDArray[np.integer], jobs: int
+) -> Touching:
+    """Those of N points (N, 3) whose nearest point of the placed model lies within a face, not on an edge.
+
+    start : the pose by which they were isolated
+    """
     distance, face = measured(near, pose, xyz, jobs)
     met = np.flatnonzero(face >= 0)
     row = np.empty(int(near.face.max()) + 1, np.int64)
@@ -162,8 +171,10 @@ def touching(near: NearSurface, pose: Pose, xyz: Floats, scan_id: NDArray[np.int
     # At an edge the distance is longer than that from the plane; single precision tells 1 µm of it.
     within = np.abs(np.abs(off) - np.abs(distance[met])) < 1e-6
     met, points, normals, off = met[within], points[within], normals[within], off[within]
+    # Isolated were the points about where the surface was then: of those farther off it now, one side is missing.
+    moved = np.abs(((points - start.inverse().move(xyz[met])) * normals).sum(axis=1))
     facing = np.rint(normals).astype(np.int64)
-    return Touching(points, normals, off, numbered(*facing.T, scan_id[met].astype(np.int64)))
+    return Touching(points, normals, off, near.reach - moved, numbered(*facing.T, scan_id[met].astype(np.int64)))
 
 
 def patches_of(on: Touching, centre: Floats, radius: float, patch: float, least_noise: float) -> Patches:
@@ -171,19 +182,35 @@ def patches_of(on: Touching, centre: Floats, radius: float, patch: float, least_
     if not len(on.off):
         return Patches(np.empty((0, 6)), np.empty(0), np.empty(0))
     noise = np.maximum(noise_of(on.off, on.group), least_noise)
-    kept = np.abs(on.off) < GATE_NOISES * noise
+    gate = np.minimum(on.gate, GATE_NOISES * noise)
+    kept = (np.abs(on.off) < gate) & (gate > NARROWEST * noise)
     points, normals, off, group = on.points[kept], on.normals[kept], on.off[kept], on.group[kept]
-    # Of what the gate leaves: the median alone takes a scan in steps (a Kinect's) for one without noise.
-    variance = np.maximum(averaged(off**2, group), least_noise**2)
+    if not len(off):
+        return Patches(np.empty((0, 6)), np.empty(0), np.empty(0))
+    gate, noise = gate[kept], noise[kept]
+    for _ in range(NOISE_STEPS):
+        # Not the median alone: it takes a scan in steps (a Kinect's) for one without noise.
+        noise = np.sqrt(np.maximum(pooled(off**2, followed(gate / noise), group), least_noise**2))
+    follows = followed(gate / noise)
     cube = np.floor(points / patch).astype(np.int64)
     member = numbered(*cube.T, group)
-    count = np.bincount(member)
+    counts = np.bincount(member, follows)
     rows = np.concatenate([np.cross(points - centre, normals) / radius, normals], axis=1)
     return Patches(
-        np.stack([np.bincount(member, column) / count for column in rows.T], axis=1),
-        np.bincount(member, off) / count,
-        np.bincount(member, variance[group]) / count**2,
+        np.stack([np.bincount(member, follows * column) / counts for column in rows.T], axis=1),
+        np.bincount(member, off) / counts,
+        np.bincount(member, follows * noise**2) / counts**2,
     )
+
+
+def followed(gate: Floats) -> Floats:
+    """What share of a shift the mean of normal values follows that are cut off at ± gate sigmas; their variance has
+    shrunk by the same.
+    """
+    sigmas = np.linspace(0.05, 6.0, 120)
+    kept = np.array([erf(sigma / sqrt(2.0)) for sigma in sigmas])
+    share = 1.0 - 2.0 * sigmas * np.exp(-0.5 * sigmas**2) / (sqrt(2.0 * pi) * kept)
+    return np.interp(gate, sigmas, share)
 
 
 def noise_of(off: Floats, group: Ints) -> Floats:
@@ -196,10 +223,11 @@ def noise_of(off: Floats, group: Ints) -> Floats:
     return np.asarray(1.4826 * np.sqrt(shared)[group])
 
 
-def averaged(values: Floats, group: Ints) -> Floats:
-    """The mean of each group's values, (G,), with `PRIOR_POINTS` of all."""
-    count = np.bincount(group)
-    return np.asarray((np.bincount(group, values) + PRIOR_POINTS * values.mean()) / (count + PRIOR_POINTS))
+def pooled(squares: Floats, counts: Floats, group: Ints) -> Floats:
+    """Of each of N points its group's sum of squares over its sum of counts, (N,), with `PRIOR_POINTS` of all."""
+    mean = squares.sum() / counts.sum()
+    by_group = np.bincount(group, squares) + PRIOR_POINTS * mean
+    return np.asarray((by_group / (np.bincount(group, counts) + PRIOR_POINTS))[group])
 
 
 def solved(patches: Patches, below: float) -> tuple[Floats, Floats, Floats]:

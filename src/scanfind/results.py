@@ -233,8 +233,8 @@ def _write_points(path: Path, instance: int, points: IsolatedPoints, findings: F
 
 CSV_COLUMNS = (
     "id", "model", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "score", "support", "visible_support", "penalty",
-    "coverage", "rms_m", "sigma_m", "sigma_deg", "points", "deviation_mean_m", "deviation_rms_m", "deviation_p95_m", "deviation_worst_m",
-    "unobservable", "isolated",
+    "coverage", "rms_m", "sigma_m", "sigma_deg", "points", "deviation_mean_m", "deviation_rms_m", "deviation_p95_m",
+    "deviation_worst_m", "unobservable", "isolated",
 )  # fmt: skip
 
 

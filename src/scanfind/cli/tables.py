@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from scanfind.simulate import Sight
 
 FOUND = (
-    "id", "model", "x m", "y m", "z m", "yaw °", "pitch °", "roll °", "score", "visible %", "rms mm", "± mm", "± °", "points",
-    "mean mm", "95 % mm", "free to",
+    "id", "model", "x m", "y m", "z m", "yaw °", "pitch °", "roll °", "score", "visible %", "rms mm", "± mm", "± °",
+    "points", "mean mm", "95 % mm", "free to",
 )  # fmt: skip
 
 
