@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import erf, exp, gamma, sqrt
+from math import erf, exp, gamma, log, sqrt
 
 import cyclopts
 import numpy as np
@@ -99,9 +99,9 @@ def normalised(error: Floats, covariance: Floats) -> tuple[float, int]:
 
 def chi2_quantile(value: float, dof: int) -> float:
     """The share of χ² of `dof` degrees of freedom that is below a value."""
-    half, first = value / 2.0, 2 - dof % 2
+    half, first = max(value, 1e-300) / 2.0, 2 - dof % 2
     below = erf(sqrt(half)) if first == 1 else 1.0 - exp(-half)
-    return below - sum(half ** (k / 2) * exp(-half) / gamma(k / 2 + 1.0) for k in range(first, dof, 2))
+    return below - sum(exp(0.5 * k * log(half) - half) / gamma(0.5 * k + 1.0) for k in range(first, dof, 2))
 
 
 def kolmogorov(quantiles: Sequence[float]) -> float:

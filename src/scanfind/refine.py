@@ -38,7 +38,7 @@ class RefineParameters:
     coarse_gates: tuple[float, float] = (1.5, 0.6)
     fine_gates: tuple[float, float] = (1.2, 0.5)
     normal_agreement: float = 0.7
-    raw_steps: int = 3
+    raw_steps: int = 2
     unobservable_below: float = 0.004
 
     def __post_init__(self) -> None:
