@@ -110,7 +110,8 @@ def kolmogorov(quantiles: Sequence[float]) -> float:
     ranked = np.sort(quantiles)
     apart = float(max((np.arange(1, n + 1) / n - ranked).max(), (ranked - np.arange(n) / n).max()))
     scaled = apart * (sqrt(n) + 0.12 + 0.11 / sqrt(n))
-    return min(1.0, max(0.0, 2.0 * sum((-1) ** (k - 1) * exp(-2.0 * (k * scaled) ** 2) for k in range(1, 101))))
+    tail = sum((1.0 if k % 2 else -1.0) * exp(-2.0 * (k * scaled) ** 2) for k in range(1, 101))
+    return min(1.0, max(0.0, 2.0 * tail))
 
 
 def summary(rows: Sequence[Row]) -> list[str]:
