@@ -18,7 +18,8 @@ from scanfind.deviation import deviation_of
 from scanfind.kernels.distance import NearSurface
 from scanfind.mesh import Mesh
 from scanfind.near_surface import near_samples, near_triangles, signed_distances
-from scanfind.polish import Polished, followed, measured, polish, polished
+from scanfind.patches import followed, measured
+from scanfind.polish import Polished, polish, polished
 from scanfind.pose import Pose, random_rotation
 from scanfind.refine import RefineParameters
 from scanfind.simulate.parts import blocks, pipe

@@ -117,6 +117,17 @@ def motion_of(vector: Floats, centre: Floats, radius: float, sigma: float | None
     return Motion("roll", triple(upright(turning)), triple(through), of_kind)
 
 
+def in_scene(covariance: Floats, rotation: Floats, radius: float) -> Floats:
+    """A covariance (6, 6) of (rotation × radius, translation) as one of radians and metres, symmetric to the last bit.
+
+    rotation : (3, 3) from the axes it is in to the scene's
+    """
+    turn = np.zeros((6, 6))
+    turn[:3, :3], turn[3:, 3:] = rotation / radius, rotation
+    found = turn @ covariance @ turn.T
+    return np.asarray(0.5 * (found + found.T))
+
+
 def upright(direction: Floats) -> Floats:
     """Unit length; the largest part positive, since an axis has no sign."""
     return np.asarray(direction / np.linalg.norm(direction) * np.sign(direction[np.argmax(np.abs(direction))]))
