@@ -158,11 +158,11 @@ def test_one_face_leaves_three_motions_open() -> None:
 
 
 def test_what_hardly_is_fixed_has_its_sigma() -> None:
-    # A handful of points on the only faces that stop a slide: less sure than one point's noise.
+    # One point on the only faces that stop a slide: no surer than that point.
     points = seen(BRACKET, 7, per_m2=400.0)
     stop = np.abs(points[:, 0]) < 0.006
     rest = (np.abs(points[:, 0] - 1.0) > 0.02) & (np.abs(points[:, 0] - 0.15) > 0.02) & (points[:, 0] < 0.58) & ~stop
-    ends = np.flatnonzero(stop & (points[:, 1] > 0.2))[:2]
+    ends = np.flatnonzero(stop & (points[:, 1] > 0.2))[:1]
     found = polish(
         near(BRACKET), PLACE, PLACE.move(points[np.concatenate([np.flatnonzero(rest), ends])]),
         np.zeros(int(rest.sum()) + len(ends), int), replace(TWICE, unobservable_below=1e-7),
@@ -172,8 +172,8 @@ def test_what_hardly_is_fixed_has_its_sigma() -> None:
     assert slide.kind == "slide"
     np.testing.assert_allclose(np.abs(slide.axis), [1, 0, 0], rtol=0, atol=0.2)
     assert slide.sigma is not None
-    # Two points, each off by 2 mm / √3 along the normal, and what the rest say of it.
-    assert 0.0004 < slide.sigma < 0.0012
+    # 2 mm / √3 along the normal, and what the rest say of it.
+    assert 0.0006 < slide.sigma < 0.0018
 
 
 def test_too_few_points_say_nothing() -> None:

@@ -75,8 +75,8 @@ class Detection:
     unobservable : motions the data do not fix, or hardly
     covariance : (6, 6) of the pose's error (rotation vector, translation of the pivot) in the scene's axes, rad and m:
         the true pose turns the found one about the pivot, then shifts it. It says nothing (is zero) along the motions
-        of `unobservable` without a sigma. None where the pose was not fitted to raw points
-    pivot : (3,) the middle of the model's box as placed, scene frame, metres; None where `covariance` is
+        of `unobservable` without a sigma. None in results of a version that had none
+    pivot : (3,) the point the covariance is about, in the middle of the placed model, scene frame, metres
     """
 
     id: int

@@ -79,7 +79,7 @@ def polish(
         # In the model's frame, about its centre: the true pose is pose @ motion.
         pose = pose @ Pose(turned, centre - turned @ centre + step[3:])
     variances, vectors = np.linalg.eigh(covariance)
-    noise = float(np.median(on.off**2))
+    noise = 1.4826**2 * float(np.median(on.off**2))
     loose = [motion_of(motion, centre, radius) for motion in free.T] + [
         motion_of(vector, centre, radius, sqrt(variance))
         for variance, vector in zip(variances, vectors.T, strict=True)

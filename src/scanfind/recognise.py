@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanfind.detection import Detection, Motion, Refused
 from scanfind.pose import Pose
-from scanfind.refine import Refined, icp, shrinking, unobservable
+from scanfind.refine import Refined, covariance_of, icp, shrinking, triple, unobservable
 from scanfind.search import AREA_OF_A_SAMPLE, Hypotheses, Search, model_arrays
 from scanfind.symmetry import self_similar
 from scanfind.verify import (
@@ -303,11 +303,15 @@ class Recognition:
         return [self._detection(number, candidate) for number, candidate in enumerate(ranked, start=1)]
 
     def _detection(self, number: int, found: Candidate) -> Detection:
-        seen = found.evidence
+        seen, radius = found.evidence, float(self.arrays.radii[found.model])
+        pivot = self._pose(found).move(self.arrays.centres[found.model][None])[0]
+        below = self.parameters.refine.unobservable_below
         return Detection(
             id=number, model=self.models[found.model].name, scene_from_model=self._pose(found), score=found.score,
             support=seen.support(), visible_support=seen.visible_support(), penalty=seen.penalty(),
             coverage=seen.support(), rms_m=seen.rms, unobservable=self._unobservable(found),
+            covariance=covariance_of(found.hessian, seen.rms, radius, below) if np.isfinite(seen.rms) else None,
+            pivot=triple(pivot),
         )  # fmt: skip
 
     def _pose(self, found: Candidate) -> Pose:
