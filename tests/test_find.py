@@ -225,6 +225,8 @@ def test_it_is_found_without_a_scanner_s_position() -> None:
     assert any("no scanner position" in note for note in found.notes)
     assert [s.stations for s in found.scans] == [(None,), (None,)]
     assert found[0].isolated is None
+    assert found[0].covariance is not None
+    assert 0.0 < found[0].sigma_m < 0.002
     assert found.tolerance_m is None
 
 

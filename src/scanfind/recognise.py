@@ -53,7 +53,7 @@ class Candidate(NamedTuple):
 
     model : its number among those sought
     rotation, translation : (3, 3), (3,) scene_from_model, relative to the grid's offset
-    hessian : (6, 6) of ICP, see Refined
+    hessian, rms : (6, 6) of ICP and what it left, metres, see Refined
     score : 0 … 1; area : supported surface, counted by how much it tells, less what was seen through, m²: by it
         conflicting poses are ranked
     """
@@ -62,6 +62,7 @@ class Candidate(NamedTuple):
     rotation: Floats
     translation: Floats
     hessian: Floats
+    rms: float
     evidence: Evidence
     score: float
     area: float
@@ -193,7 +194,8 @@ class Recognition:
             found.append(
                 Candidate(
                     number, refined.hypotheses.rotations[k], refined.hypotheses.translations[k], refined.hessians[k],
-                    seen, score(seen, self.blind, verify), net * seen.samples * AREA_OF_A_SAMPLE * model.spacing**2,
+                    float(refined.rms[k]), seen, score(seen, self.blind, verify),
+                    net * seen.samples * AREA_OF_A_SAMPLE * model.spacing**2,
                 )
             )  # fmt: skip
         return found
@@ -310,7 +312,7 @@ class Recognition:
             id=number, model=self.models[found.model].name, scene_from_model=self._pose(found), score=found.score,
             support=seen.support(), visible_support=seen.visible_support(), penalty=seen.penalty(),
             coverage=seen.support(), rms_m=seen.rms, unobservable=self._unobservable(found),
-            covariance=covariance_of(found.hessian, seen.rms, radius, below) if np.isfinite(seen.rms) else None,
+            covariance=covariance_of(found.hessian, found.rms, radius, below) if np.isfinite(found.rms) else None,
             pivot=triple(pivot),
         )  # fmt: skip
 

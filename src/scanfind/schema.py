@@ -84,7 +84,7 @@ class DetectionEntry(Entry):
     `covariance` is of the error of `scene_from_model`, rows and columns (rx, ry, rz, x, y, z) in the axes of the scan
     file, radians and metres: the true pose is the found one turned by the rotation vector (rx, ry, rz) about `pivot_m`,
     a point of the scan file's frame, then shifted by (x, y, z). No number is infinite: along those of `unobservable`
-    whose sigma is null it is zero, and means nothing; it has no inverse then, but a pseudo-inverse. It knows what points
+    whose sigma is null it is zero, and means nothing; it has a pseudo-inverse then, no inverse. It knows what points
     disagree by, not what they are all off by, such as a registration. `sigma_m` and `sigma_rad` say it in short: by how
     much the pivot and the rotation are off, root mean square. All four are null in results of an earlier version.
     """
