@@ -19,7 +19,7 @@ from scanfind.mesh import Mesh
 from scanfind.model import Model, ModelParameters, build_model
 from scanfind.moments import MomentGrid
 from scanfind.pose import Pose, random_rotation
-from scanfind.refine import Refined, icp, shrinking, unobservable
+from scanfind.refine import Refined, covariance_of, icp, shrinking, unobservable
 from scanfind.search import Hypotheses, ModelArrays, model_arrays
 from scanfind.simulate.parts import blocks, pipe
 from scanfind.simulate.placement import surface_points
@@ -162,6 +162,26 @@ def test_a_straight_pipe_slides_and_rolls() -> None:
 def test_nothing_is_open_on_an_irregular_body() -> None:
     result, arrays = refined(model_of(BRACKET), seen(BRACKET, PLACE), [PLACE])
     assert motions(result, arrays) == ()
+
+
+def test_the_covariance_is_the_inverse_of_what_the_data_fix() -> None:
+    result, arrays = refined(model_of(BRACKET), seen(BRACKET, PLACE), [PLACE])
+    radius = float(arrays.radii[0])
+    covariance = covariance_of(result.hessians[0], 0.001, radius, 0.004)
+    scaled = covariance * np.outer(scale := np.repeat([radius, 1.0], 3), scale)
+    np.testing.assert_allclose(scaled @ result.hessians[0], 1e-6 * np.eye(6), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(covariance, covariance.T)
+    np.testing.assert_allclose(covariance_of(result.hessians[0], 0.002, radius, 0.004), 4 * covariance, rtol=1e-12)
+
+
+def test_the_covariance_is_zero_along_what_they_leave_open() -> None:
+    result, arrays = refined(
+        model_of(PIPE), seen(pipe(0.1, 3.0), Pose.identity()), [Pose(np.eye(3), np.array([0, 0, 1.0]))]
+    )
+    covariance = covariance_of(result.hessians[0], 0.001, float(arrays.radii[0]), 0.004)
+    assert np.linalg.matrix_rank(covariance, tol=1e-6 * np.trace(covariance)) == 4
+    slide, roll = covariance[5, 5] / np.trace(covariance[3:, 3:]), covariance[2, 2] / np.trace(covariance[:3, :3])
+    assert max(slide, roll) < 1e-3
 
 
 # ── nearest surfels ──

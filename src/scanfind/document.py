@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic_core import to_jsonable_python
 
 from scanfind import schema
@@ -147,12 +148,25 @@ def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -
         penalty=_or_none(found.penalty),
         coverage=_or_none(found.coverage),
         rms_m=_or_none(found.rms_m),
-        unobservable=[schema.MotionEntry(kind=m.kind, axis=m.axis, through_m=m.through) for m in found.unobservable],
+        unobservable=[_motion_entry(motion) for motion in found.unobservable],
         points=0 if found.isolated is None else len(found.isolated),
         isolated=isolated,
         pose=pose,
         deviation=None if deviation is None else _deviation_entry(deviation),
+        covariance=None if found.covariance is None else _covariance(found.covariance),
+        pivot_m=found.pivot,
+        sigma_m=_or_none(found.sigma_m),
+        sigma_rad=_or_none(found.sigma_rad),
     )
+
+
+def _motion_entry(motion: Motion) -> schema.MotionEntry:
+    return schema.MotionEntry(kind=motion.kind, axis=motion.axis, through_m=motion.through, sigma=motion.sigma)
+
+
+def _covariance(matrix: NDArray[np.float64]) -> schema.Covariance:
+    a, b, c, d, e, f = (tuple(row) for row in matrix.tolist())
+    return a, b, c, d, e, f
 
 
 def _deviation_entry(deviation: Deviation) -> schema.DeviationEntry:
@@ -203,8 +217,10 @@ def _detection(entry: schema.DetectionEntry) -> Detection:
         penalty=_or_nan(entry.penalty),
         coverage=_or_nan(entry.coverage),
         rms_m=_or_nan(entry.rms_m),
-        unobservable=tuple(Motion(m.kind, m.axis, m.through_m) for m in entry.unobservable),
+        unobservable=tuple(Motion(m.kind, m.axis, m.through_m, m.sigma) for m in entry.unobservable),
         deviation=None if deviation is None else Deviation(*map(_or_nan, deviation.model_dump().values())),
+        covariance=None if entry.covariance is None else np.array(entry.covariance),
+        pivot=entry.pivot_m,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -23,6 +23,7 @@ from scanfind.model import Model, ModelParameters
 from scanfind.moments import MomentGrid
 from scanfind.near_surface import near_model
 from scanfind.parameters import PRESETS, IsolationParameters, Parameters
+from scanfind.polish import polished
 from scanfind.recognise import Recognition
 from scanfind.scene import build_scene, first_cell
 from scanfind.sources import Scan, Sources, require_points
@@ -30,6 +31,7 @@ from scanfind.threads import available_cores
 
 if TYPE_CHECKING:
     from scanfind.detection import Detection
+    from scanfind.kernels.distance import NearSurface
     from scanfind.progress import Progress
     from scanfind.scans import CloudWriter
 
@@ -106,7 +108,10 @@ def find(
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
             tolerance = isolation_tolerance(parameters.isolate, found.noise(), scene.fine.cell)
             findings.tolerance_m = tolerance
-            findings[:] = with_points(findings, library, chunks, tolerance, remainder, jobs)
+            surfaces = surfaces_of(findings, library, tolerance)
+            findings[:] = with_points(findings, surfaces, chunks, tolerance, remainder, jobs)
+        with clock("refine"):  # 3.4 once more, on the raw points: the exact surface, and how uncertain the pose is
+            findings[:] = [polished(one, surfaces[one.model], parameters.refine, jobs) for one in findings]
     findings.scans = [source.told() for source in sources.all]
     findings.crs, findings.notes = sources.crs(), found.notes()
     findings.shift = tuple(shift_for(scene.fine.cells.offset).tolist())
@@ -162,16 +167,17 @@ def isolation_tolerance(parameters: IsolationParameters, noise: float, cell: flo
     return min(max(parameters.noises * noise, 0.1 * cell), 0.5 * cell)
 
 
+def surfaces_of(findings: Sequence[Detection], library: Sequence[Model], tolerance: float) -> dict[str, NearSurface]:
+    """The surface of each model found, to be asked for distances up to `tolerance`, metres."""
+    names = {found.model for found in findings}
+    return {model.name: near_model(model, tolerance) for model in library if model.name in names}
+
+
 def with_points(
-    findings: Sequence[Detection], library: Sequence[Model], chunks: Iterable[PointChunk], tolerance: float,
+    findings: Sequence[Detection], surfaces: Mapping[str, NearSurface], chunks: Iterable[PointChunk], tolerance: float,
     remainder: CloudWriter | None, jobs: int,
 ) -> list[Detection]:  # fmt: skip
     """Each detection with its raw points and how far they are from its model."""
-    surfaces = {
-        model.name: near_model(model, tolerance)
-        for model in library
-        if any(found.model == model.name for found in findings)
-    }
     placed = [Placed(found.id, surfaces[found.model], found.scene_from_model) for found in findings]
     rest = None if remainder is None else lambda chunk: write_rest(remainder, chunk)
     points = isolate_raw(chunks, placed, IsolateParameters(tolerance), remainder=rest, jobs=jobs)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scanfind.detection import Detection, Motion, Refused
 from scanfind.free_space import Limits, caster_of, spoken_of
 from scanfind.pose import Pose
-from scanfind.refine import Refined, icp, shrinking, unobservable
+from scanfind.refine import Refined, covariance_of, icp, shrinking, triple, unobservable
 from scanfind.search import AREA_OF_A_SAMPLE, Hypotheses, Search, model_arrays
 from scanfind.verify import (
     Evidence,
@@ -56,7 +56,7 @@ class Candidate(NamedTuple):
 
     model : its number among those sought
     rotation, translation : (3, 3), (3,) scene_from_model, relative to the grid's offset
-    hessian : (6, 6) of ICP, see Refined
+    hessian, rms : (6, 6) of ICP and what it left, metres, see Refined
     score : 0 … 1; area : supported surface, counted by how much it tells, less what was seen through, m²: by it
         conflicting poses are ranked
     """
@@ -65,6 +65,7 @@ class Candidate(NamedTuple):
     rotation: Floats
     translation: Floats
     hessian: Floats
+    rms: float
     evidence: Evidence
     score: float
     area: float
@@ -191,7 +192,7 @@ class Recognition:
             found.append(
                 Candidate(
                     number, refined.hypotheses.rotations[k], refined.hypotheses.translations[k], refined.hessians[k],
-                    seen, score(seen, self.blind, self.parameters.verify),
+                    float(refined.rms[k]), seen, score(seen, self.blind, self.parameters.verify),
                     net * AREA_OF_A_SAMPLE * self.models[number].spacing ** 2,
                 )
             )  # fmt: skip
@@ -323,11 +324,15 @@ class Recognition:
         return [self._detection(number, candidate) for number, candidate in enumerate(ranked, start=1)]
 
     def _detection(self, number: int, found: Candidate) -> Detection:
-        seen = found.evidence
+        seen, radius = found.evidence, float(self.arrays.radii[found.model])
+        pivot = self._pose(found).move(self.arrays.centres[found.model][None])[0]
+        below = self.parameters.refine.unobservable_below
         return Detection(
             id=number, model=self.models[found.model].name, scene_from_model=self._pose(found), score=found.score,
             support=seen.support(), visible_support=seen.visible_support(), penalty=seen.penalty(),
             coverage=seen.support(), rms_m=seen.rms, unobservable=self._unobservable(found),
+            covariance=covariance_of(found.hessian, found.rms, radius, below) if np.isfinite(found.rms) else None,
+            pivot=triple(pivot),
         )  # fmt: skip
 
     def _pose(self, found: Candidate) -> Pose:
