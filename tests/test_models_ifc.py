@@ -25,9 +25,9 @@ def meshes(path: Path, *select: str) -> list[Mesh]:
 
 
 @cache
-def whole(path: Path) -> list[Mesh]:
-    """All models of a file, read once for all tests: one takes the reader half a minute."""
-    return meshes(path)
+def once(path: Path, *select: str) -> list[Mesh]:
+    """The models of a file, read once for all tests: one file takes the reader 34 s."""
+    return meshes(path, *select)
 
 
 def products(found: list[Mesh]) -> dict[str, np.ndarray]:
@@ -62,9 +62,13 @@ WHOLE = (
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n == WHOLE[0] else pytest.mark.slow) for n in WHOLE])
 def test_every_product_is_placed_once(shared_data: Path, name: str) -> None:
     elements, triangles = checked((shared_data / "ifc/CHECK.txt").read_text())[name]
-    found = whole(shared_data / "ifc" / name)
+    found = once(shared_data / "ifc" / name)
     assert len(products(found)) == sum(len(mesh.placements) for mesh in found) == elements
     assert sum(len(mesh.faces) * len(mesh.placements) for mesh in found) == triangles
+
+
+# Windows of 1,438 products: the reader takes 50 s for all of them, and 5 for these 328.
+PART = {"002.ifc": ("IfcColumn", "IfcPlate")}
 
 
 @pytest.mark.slow
@@ -72,7 +76,7 @@ def test_every_file_is_read_or_one_clear_line(shared_data: Path) -> None:
     refused = {}
     for path in sorted((shared_data / "ifc").rglob("*.ifc")):
         try:
-            assert whole(path)
+            assert once(path, *PART.get(path.name, ()))
         except ScanfindError as error:
             refused[path.name] = str(error)
     assert sorted(refused) == [
