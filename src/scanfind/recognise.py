@@ -47,6 +47,9 @@ ALL_SAMPLES = 1 << 30
 # Share of the score asked for that the evidence on the coarse surfels must reach: there 400 samples tell the final
 # score of a shop's 96 best poses within 0.2.
 PROMISING = 0.67
+# A score that none of the poses a model could be taken for reaches: of 218 wrong poses in shops one was above 0.96, of
+# 128 right ones in shops sparse or with half of the object gone 60.
+SURE = 0.98
 NET_PENALTY = 2.0
 REFUSED_SHOWN = 3  # of each model: what came closest
 
@@ -305,6 +308,8 @@ class Recognition:
 
     def _best_of_similar(self, candidate: Candidate) -> Candidate:
         """The best of a pose and those it could be taken for: the model turned over onto itself, each refined again."""
+        if candidate.score >= SURE:
+            return candidate
         number = candidate.model
         placed = Pose(candidate.rotation, candidate.translation)
         others = [placed @ motion for motion in self._similar(number)]
