@@ -68,8 +68,8 @@ class Detection:
     scene_from_model : in the scan file's own frame, metres
     score : 0 … 1, how much the evidence speaks for it (see `verify`)
     support : share of the model's surface samples that lie on the scene (the paper's λs = m_s / m)
-    visible_support : the same among those samples a scanner could see: supported / (supported + seen through)
-    penalty : share of samples through which a beam passed (Papazov & Burschka 2010); 0 without origins
+    visible_support : share of the surface the scanners' beams speak of that they ended on; 0 without origins
+    penalty : share of the surface beams went to through which they passed (Papazov & Burschka 2010); 0 without origins
     coverage : share of the model's surface the scan shows, 0 … 1
     rms_m : root mean square distance of supported samples to the scene's surface
     unobservable : motions the data do not fix, or hardly
