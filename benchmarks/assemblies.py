@@ -18,7 +18,7 @@ import cyclopts
 import numpy as np
 
 import scanfind
-from benchmarks.common import Floats, centre_of, median, pose_error, seeds_of, tell, write_csv
+from benchmarks.common import Floats, median, pose_error, seeds_of, symmetry_of, tell, write_csv
 from scanfind.assembly import AssemblyParameters
 from scanfind.assembly.parts import first_cut
 from scanfind.detection import PartFit
@@ -131,8 +131,8 @@ def scene_row(seed: int, kind: str, points: int, *, rigid: bool) -> Row:
     default = scanfind.PRESETS["default"]
     parameters = replace(default, assembly=AssemblyParameters(parts=not rigid))
     found = scanfind.find(scanned.stations, case.design, parameters=parameters, seed=seed)
-    truth, centre = scanned.truth[case.built.name][0], centre_of(case.design.vertices)
-    errors = [pose_error(one.scene_from_model, truth, centre) for one in found]
+    truth, symmetry = scanned.truth[case.built.name][0], symmetry_of(case.design)
+    errors = [pose_error(one.scene_from_model, truth, symmetry) for one in found]
     right = [k for k, error in enumerate(errors) if error.within(FOUND_MM, FOUND_DEG) and kind != "sibling"]
     best = right[0] if right else -1
     part = branch_part(found[best].parts, case) if best >= 0 and found[best].parts else None

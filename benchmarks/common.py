@@ -7,6 +7,7 @@ import platform
 import subprocess
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+import scanfind
+from scanfind.cloud import CloudModel
+from scanfind.cloud_surface import sample_cloud
+from scanfind.mesh import Mesh
+from scanfind.onto_itself import OntoItself
 from scanfind.pose import Pose
+from scanfind.surface import SurfaceParameters, sample_mesh
+from scanfind.symmetries import find_symmetry
+from scanfind.symmetry import Symmetry
 from scanfind.threads import available_cores
 
 if TYPE_CHECKING:
@@ -29,7 +38,7 @@ STAGES = ("grid", "search", "refine", "verify", "isolate")
 
 @dataclass(frozen=True)
 class PoseError:
-    """How far a pose is from the truth: of the model's centre in millimetres, of its rotation in degrees."""
+    """How far a pose is from the truth: of its symmetry's centre in millimetres, of its rotation in degrees."""
 
     mm: float
     deg: float
@@ -38,10 +47,25 @@ class PoseError:
         return self.mm <= mm and self.deg <= deg
 
 
-def pose_error(found: Pose, truth: Pose, centre: Floats) -> PoseError:
-    """At the model's centre (3,), model frame: an origin far from the model would turn degrees into millimetres."""
-    apart = np.linalg.norm(found.move(centre[None]) - truth.move(centre[None]))
-    return PoseError(1e3 * float(apart), float(np.degrees(found.difference(truth)[1])))
+def pose_error(found: Pose, truth: Pose, symmetry: Symmetry) -> PoseError:
+    """`scanfind.pose_error` in millimetres, at the symmetry's centre, and degrees."""
+    error = scanfind.pose_error(found, truth, symmetry)
+    return PoseError(1e3 * error.translation_m, float(np.degrees(error.rotation_rad)))
+
+
+@lru_cache(maxsize=8)
+def symmetry_of(model: Mesh | CloudModel) -> Symmetry:
+    """The rotations that do not count as errors of a model's pose; where there are none, about the middle of its box.
+
+    An origin far from the model would turn degrees into millimetres.
+    """
+    if isinstance(model, Mesh):
+        itself = OntoItself(sample_mesh(model, SurfaceParameters()), model)
+    else:
+        itself = OntoItself(sample_cloud(model, SurfaceParameters()), None)
+    found = find_symmetry(itself)
+    points = model.vertices if isinstance(model, Mesh) else model.points
+    return found if found.axes else Symmetry(centre_of(points))
 
 
 def centre_of(points: Floats) -> Floats:

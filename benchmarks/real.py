@@ -15,7 +15,7 @@ import cyclopts
 import numpy as np
 
 import scanfind
-from benchmarks.common import ROOT, Floats, PoseError, centre_of, pose_error, seeds_of, tell, write_csv
+from benchmarks.common import ROOT, Floats, PoseError, pose_error, seeds_of, symmetry_of, tell, write_csv
 from scanfind.detection import Detection, Refused
 
 PUMP = ROOT / "examples" / "pump"
@@ -94,7 +94,7 @@ def skids(data: Path, seed: int) -> list[Row]:
     first_from_second = scanfind.Pose.from_matrix(derived["unit_B_to_unit_A"])
     truths = {"first": scanfind.Pose.identity(), "second": first_from_second.inverse()}
     found = scanfind.find(PUMP / "scan.e57", model, seed=seed)
-    return rows_of("skid", seed, found, judge_of(truths, centre_of(model.points), SKID_LIMITS))
+    return rows_of("skid", seed, found, judge_of(truths, symmetry_of(model), SKID_LIMITS))
 
 
 def pipes(data: Path, seed: int) -> list[Row]:
@@ -114,7 +114,7 @@ def milk(data: Path, seed: int) -> list[Row]:
     carton = points_of(data / "milk_segment_in_scene.pcd")
     exact = Exact(carton, held_by(truth.move(model.points), carton))
     found = scanfind.find(data / "scene.pcd", model, seed=seed)
-    judge = judge_of({"milk": truth}, centre_of(model.points), MILK_LIMITS)
+    judge = judge_of({"milk": truth}, symmetry_of(model), MILK_LIMITS)
     return rows_of("milk", seed, found, judge, exact)
 
 
@@ -127,11 +127,11 @@ def held_by(model: Floats, exact: Floats) -> Floats:
     return near
 
 
-def judge_of(truths: dict[str, scanfind.Pose], centre: Floats, limits: tuple[float, float]) -> Judge:
+def judge_of(truths: dict[str, scanfind.Pose], symmetry: scanfind.Symmetry, limits: tuple[float, float]) -> Judge:
     """Right for the nearest true pose where it is within limits (mm, degrees)."""
 
     def judge(pose: scanfind.Pose) -> Judged:
-        errors = {name: pose_error(pose, truth, centre) for name, truth in truths.items()}
+        errors = {name: pose_error(pose, truth, symmetry) for name, truth in truths.items()}
         name = min(errors, key=lambda one: errors[one].mm)
         return Judged(name if errors[name].within(*limits) else "", errors[name])
 

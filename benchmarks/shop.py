@@ -16,12 +16,11 @@ import numpy as np
 import scanfind
 from benchmarks.common import (
     STAGES,
-    Floats,
     PoseError,
-    centre_of,
     median,
     pose_error,
     seeds_of,
+    symmetry_of,
     tell,
     write_csv,
 )
@@ -30,7 +29,7 @@ from scanfind.simulate.scanner import SimulatedScan, scan
 from scanfind.simulate.scenes import Scene, shop
 
 TARGETS = {"ps": pipe_spool, "bf": box_frame}
-# What issue 2 calls found. Neither target is symmetric: a frame turned over is a wrong answer.
+# What issue 2 calls found. Neither target has a symmetry: a frame turned over is a wrong answer.
 FOUND_MM, FOUND_DEG = 10.0, 0.5
 WARM_UP_POINTS = 50_000
 NAN = float("nan")
@@ -136,11 +135,13 @@ def find_in(scene: Scene, mesh: scanfind.Mesh, seed: int, points: int, parameter
 
 def errors_of(found: scanfind.Findings, scanned: SimulatedScan, mesh: scanfind.Mesh) -> list[PoseError]:
     """Of each detection, to the nearest true pose; infinite where the scene holds no target."""
-    centre: Floats = centre_of(mesh.vertices)
+    symmetry = symmetry_of(mesh)
     truths = scanned.truth.get(mesh.name, [])
     nowhere = PoseError(float("inf"), float("inf"))
     return [
-        min((pose_error(one.scene_from_model, truth, centre) for truth in truths), key=lambda e: e.mm, default=nowhere)
+        min(
+            (pose_error(one.scene_from_model, truth, symmetry) for truth in truths), key=lambda e: e.mm, default=nowhere
+        )
         for one in found
     ]
 

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from itertools import product
+from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from naive_simulate import first_hit
+from scanfind.free_space import Limits, Spoken
+from scanfind.pose import Pose
+
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 
 def kabsch(source: Floats, target: Floats) -> tuple[Floats, Floats]:
@@ -67,3 +72,48 @@ def nearest(
     far[(alike < cosine) | (far >= gate)] = np.inf
     best = int(far.argmin())
     return best if far[best] < np.inf else -1
+
+
+def self_overlap(points: Floats, normals: Floats, signed: bool, some: int, pose: Pose, reach: float) -> float:
+    """Share of the first `some` samples (N, 3) that a motion brings near a sample with a like normal."""
+    apart = np.linalg.norm(pose.move(points[:some])[:, None] - points[None], axis=2)
+    along = pose.turn(normals[:some]) @ normals.T
+    like = (along if signed else np.abs(along)) > 0.7
+    return float(((apart <= reach) & like).any(axis=1).mean())
+
+
+def shift_table(points: Floats, normals: Floats, signed: bool, per_metre: float, reach: Ints) -> Ints:
+    """How often each shift, in cells about the middle of the table, leads from a sample to one of like normal."""
+    table = np.zeros(2 * reach + 1, np.int64)
+    for i, j in permutations(range(len(points)), 2):
+        along = float(normals[i] @ normals[j])
+        if (along if signed else abs(along)) > 0.9:
+            table[tuple(reach + np.round((points[i] - points[j]) * per_metre).astype(np.int64))] += 1
+    return table
+
+
+def spoken(triangles: Floats, ends: tuple[Floats, Floats], limits: Limits) -> Spoken:
+    """What beams from zero say of triangles (F, 3, 3), one by one; ends : of the beams (B, 3), solid angles (B,)."""
+    told = dict.fromkeys(Spoken._fields, 0.0)
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    for end, angle in zip(*ends, strict=True):
+        far = float(np.linalg.norm(end))
+        way = end / far
+        distance, face = first_hit(np.zeros(3), way, triangles)
+        cosine = abs(float(normals[face] @ way))
+        if face < 0 or cosine < limits.facing:
+            continue
+        if far > distance + limits.margin:
+            side = np.cross(way, [1.0, 0.0, 0.0] if abs(way[0]) < 0.6 else [0.0, 1.0, 0.0])
+            side *= limits.inlier / np.linalg.norm(side)
+            sides = [side, -side, np.cross(way, side), -np.cross(way, side)]
+            if any(first_hit(start, way, triangles)[0] >= far - limits.margin for start in sides):
+                continue
+            what = "through"
+        elif abs(far - distance) * cosine <= limits.inlier:
+            what = "on"
+        else:
+            what = "hidden" if far < distance - limits.margin else "beside"
+        told[what] += angle * distance**2 / cosine
+    return Spoken(**told)

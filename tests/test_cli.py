@@ -186,12 +186,26 @@ def test_a_library_is_listed_shown_and_shrunk(shop: Path, tmp_path: Path, capsys
     assert main(["library", "list", library]) == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["model", "ball", "spool"]
     assert main(["library", "show", library, "ball", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["diameter"] == pytest.approx(0.6, rel=0.02)
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["diameter"] == pytest.approx(0.6, rel=0.02)
+    assert shown["symmetry"]["words"] == "free to turn about every axis"
+    assert main(["library", "show", library, "spool"]) == 0
+    assert "symmetry   none\n" in capsys.readouterr().out
     assert main(["library", "show", library, "bal"]) == 1
     assert "did you mean 'ball'?" in capsys.readouterr().err
     assert main(["library", "remove", library, "ball"]) == 0
     assert main(["library", "list", library, "--json"]) == 0
     assert [model["name"] for model in json.loads(capsys.readouterr().out)] == ["spool"]
+
+
+def test_a_symmetry_is_declared(shop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    library = str(tmp_path / "parts.scanfind")
+    add = ["library", "add", library, str(shop / "ball.stl"), "--units", "mm", "--symmetry"]
+    assert main([*add, "z5,x4"]) == 2
+    assert "make no finite group" in capsys.readouterr().err
+    assert main([*add, "z4,x2"]) == 0
+    assert main(["library", "show", library, "ball"]) == 0
+    assert "symmetry   4-fold about z; 2-fold about x\n" in capsys.readouterr().out
 
 
 def test_reading_a_library_that_is_not_there_makes_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,7 +26,9 @@ from scanfind.mesh import Mesh, Placement
 from scanfind.model import build_model, model_hash
 from scanfind.pairs import PairParameters, PairTable, key_count
 from scanfind.pose import Pose
+from scanfind.self_similar import Similar
 from scanfind.surface import SurfaceParameters
+from scanfind.symmetry import Symmetry, parse_axes
 from test_surface import box, tube
 
 SMALL = ModelParameters(SurfaceParameters(samples=60), PairParameters(angle_cell_deg=30.0))
@@ -101,6 +103,8 @@ def models(draw: st.DrawFn) -> Model:
         origin = draw(st.none() | rows(1, 3).map(lambda row: row[0]))
         cloud = CloudModel(name, draw(rows(n, 3)), source, origin)
     signed = draw(st.booleans())
+    axes = draw(st.sampled_from(["none", "x2", "x2,y2,z2", "z*,y2", "x*,z*"]))
+    similar = draw(st.lists(st.builds(Similar, floats, st.builds(Pose, rows(3, 3), rows(1, 3).map(lambda r: r[0])))))
     return Model(
         name=name,
         sha256=draw(st.text("0123456789abcdef", min_size=64, max_size=64)),
@@ -112,6 +116,8 @@ def models(draw: st.DrawFn) -> Model:
         mesh=mesh,
         cloud=cloud,
         pairs=PairTable(np.array(sorted(draw(keys)), np.int32), draw(ends), draw(ends)),
+        symmetry=Symmetry(draw(rows(1, 3))[0], parse_axes(axes)),
+        similar=tuple(similar),
         placements=tuple(placements),
         parameters=parameters,
     )
@@ -281,7 +287,7 @@ def never_ending_view(path: Path) -> None:
         (lambda path: path.write_bytes(b"solid box\n" * 1000), "is not a model library"),
         (lambda path: path.write_bytes(b"SQLite format 3\0" + bytes(5000)), "is (not a model library|damaged)"),
         (other_application, "is not a model library"),
-        (other_version, "has version 99, this scanfind reads 1"),
+        (other_version, "has version 99, this scanfind reads 2"),
         (never_ending_view, "is damaged"),
     ],
 )

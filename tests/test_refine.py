@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 import naive
 from scanfind.cloud import PointChunk
 from scanfind.detection import Motion
-from scanfind.kernels.nearest import nearest_surfel
+from scanfind.kernels.blocks import unpack_block
+from scanfind.kernels.nearest import mark_around, mark_rows, nearest_surfel
 from scanfind.mesh import Mesh
 from scanfind.model import Model, ModelParameters, build_model
 from scanfind.moments import MomentGrid
 from scanfind.pose import Pose, random_rotation
-from scanfind.refine import Refined, icp, shrinking, unobservable
+from scanfind.refine import Refined, covariance_of, icp, shrinking, unobservable
 from scanfind.search import Hypotheses, ModelArrays, model_arrays
 from scanfind.simulate.parts import blocks, pipe
 from scanfind.simulate.placement import surface_points
 from scanfind.surface import SurfaceParameters
 from scanfind.surfels import Surfels
-from scanfind.symmetry import self_similar
 
 Floats = NDArray[np.float64]
 
@@ -164,6 +164,26 @@ def test_nothing_is_open_on_an_irregular_body() -> None:
     assert motions(result, arrays) == ()
 
 
+def test_the_covariance_is_the_inverse_of_what_the_data_fix() -> None:
+    result, arrays = refined(model_of(BRACKET), seen(BRACKET, PLACE), [PLACE])
+    radius = float(arrays.radii[0])
+    covariance = covariance_of(result.hessians[0], 0.001, radius, 0.004)
+    scaled = covariance * np.outer(scale := np.repeat([radius, 1.0], 3), scale)
+    np.testing.assert_allclose(scaled @ result.hessians[0], 1e-6 * np.eye(6), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(covariance, covariance.T)
+    np.testing.assert_allclose(covariance_of(result.hessians[0], 0.002, radius, 0.004), 4 * covariance, rtol=1e-12)
+
+
+def test_the_covariance_is_zero_along_what_they_leave_open() -> None:
+    result, arrays = refined(
+        model_of(PIPE), seen(pipe(0.1, 3.0), Pose.identity()), [Pose(np.eye(3), np.array([0, 0, 1.0]))]
+    )
+    covariance = covariance_of(result.hessians[0], 0.001, float(arrays.radii[0]), 0.004)
+    assert np.linalg.matrix_rank(covariance, tol=1e-6 * np.trace(covariance)) == 4
+    slide, roll = covariance[5, 5] / np.trace(covariance[3:, 3:]), covariance[2, 2] / np.trace(covariance[:3, :3])
+    assert max(slide, roll) < 1e-3
+
+
 # ── nearest surfels ──
 
 
@@ -194,35 +214,19 @@ def scattered() -> Surfels:
     return Surfels(grid).fit()
 
 
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**32), st.integers(0, 8), st.integers(1, 40))
+def test_marked_are_the_cells_of_a_cube_about_each_point(seed: int, reach: int, count: int) -> None:
+    points = np.random.default_rng(seed).uniform(-1.3, 1.3, (count, 3))
+    cells = scattered().cells
+    layers, marked = np.zeros((len(cells.block_rows), 8), np.uint64), np.zeros(len(scattered().sides), np.bool_)
+    mark_around(points, reach, cells.cell, cells.hash_keys, cells.hash_values, layers)
+    mark_rows(cells.order, layers, cells.block_rows, marked)
+    blocks = np.repeat(cells.order, np.diff(cells.first_cell))
+    corners = np.array([unpack_block(key) for key in cells.block_keys[blocks]]) * 8
+    places = corners + np.stack([cells.locals >> 6, (cells.locals >> 3) & 7, cells.locals & 7], axis=1)
+    apart = np.abs(places[:, None] - np.floor(points / cells.cell)).max(axis=2).min(axis=1)
+    np.testing.assert_array_equal(marked[cells.rows], apart <= reach)
+
+
 # ── self-similar poses ──
-
-
-def test_a_box_is_itself_after_three_half_turns() -> None:
-    model = model_of(blocks("box", [((0, 0, 0), (1.0, 0.7, 0.4))]))
-    found = [pose for pose in self_similar(model) if overlap(model, pose) > 0.9]
-    halves = [np.diag(d) for d in ([1.0, -1, -1], [-1.0, 1, -1], [-1.0, -1, 1])]
-    for half in halves:
-        middle = np.array([0.5, 0.35, 0.2])
-        expected = Pose(half, middle - half @ middle)
-        assert min(pose.difference(expected)[0] + pose.difference(expected)[1] for pose in found) < 0.02
-    assert len(found) == 3
-
-
-def test_a_cube_is_itself_after_all_turns_but_none() -> None:
-    model = model_of(blocks("cube", [((0, 0, 0), (0.5, 0.5, 0.5))]))
-    found = self_similar(model)
-    assert len([pose for pose in found if overlap(model, pose) > 0.9]) == 23
-    assert all(pose.difference(Pose.identity())[1] > 0.05 for pose in found)
-    assert len(self_similar(model, most=5)) == 5
-
-
-def test_an_irregular_body_is_itself_after_no_turn() -> None:
-    model = model_of(BRACKET)
-    assert all(overlap(model, pose) < 0.8 for pose in self_similar(model))
-
-
-def overlap(model: Model, pose: Pose) -> float:
-    """Share of samples that a motion brings near a sample with a like normal: all against all."""
-    points, normals = pose.move(model.samples.points), pose.turn(model.samples.normals)
-    apart = np.linalg.norm(points[:, None] - model.samples.points[None], axis=2)
-    return float(((apart <= 2 * model.spacing) & (normals @ model.samples.normals.T > 0.7)).any(axis=1).mean())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +27,9 @@ from scanfind.scans import read_scan
 PROMISED = {
     "": "schema scanfind seed parameters shift_m crs scans models detections refused timings_s peak_memory_bytes",
     "scans": "path points dropped stations_m",
-    "models": "name sha256 diameter_m pairs",
+    "models": "name sha256 diameter_m pairs symmetry",
     "detections": "id model scene_from_model translation_m quaternion score support visible_support penalty coverage "
-    "rms_m unobservable points isolated",
+    "rms_m unobservable points isolated covariance pivot_m sigma_m sigma_rad",
     "timings_s": "read grid search verify refine isolate write total",
 }
 
@@ -88,8 +88,11 @@ def _detection(number: int, model: str, rng: np.random.Generator, points: int) -
         deviation=rng.normal(0, 0.002, points).astype(np.float32),
     )
     deviation = Deviation(0.0001, 0.002, 0.004, -0.009) if points else None
-    free = (Motion("roll", (1.0, 0.0, 0.0), (0.0, 0.0, 0.1)),)
-    return Detection(number, model, pose, 0.9, 0.6, 0.95, 0.01, 0.55, 0.0012, free, isolated, deviation)
+    free = (Motion("roll", (1.0, 0.0, 0.0), (0.0, 0.0, 0.1), 0.02 if points else None),)
+    found = Detection(number, model, pose, 0.9, 0.6, 0.95, 0.01, 0.55, 0.0012, free, isolated, deviation)
+    root = rng.normal(0, 1e-4, (6, 6))
+    pivot = tuple(pose.translation.tolist())
+    return replace(found, covariance=root @ root.T, pivot=pivot) if points else found
 
 
 def test_results_json_keeps_the_promised_schema(tmp_path: Path, findings: Findings, models: ModelLibrary) -> None:
@@ -113,6 +116,10 @@ def test_results_json_keeps_the_promised_schema(tmp_path: Path, findings: Findin
     assert results["scans"][0]["stations_m"] == [[1.0, 2.0, 3.0], None]
     assert results["refused"][0]["penalty"] is None
     assert {model["name"]: model["pairs"] > 0 for model in results["models"]} == {"Rohr Ø 168/4": True, "frame": True}
+    for model, summary in zip(results["models"], models.show(), strict=True):
+        assert model["symmetry"]["words"] == summary.symmetry.words()
+        assert [axis["order"] or 0 for axis in model["symmetry"]["axes"]] == [a.order for a in summary.symmetry.axes]
+        assert model["symmetry"]["centre_m"] == summary.symmetry.centre.tolist()
     assert results["timings_s"]["total"] == pytest.approx(4.0 + results["timings_s"]["write"])
     assert results["peak_memory_bytes"] > 1_000_000
     for entry, found in zip(results["detections"], findings, strict=True):
@@ -129,6 +136,16 @@ def test_document_and_back_is_the_identity(findings: Findings, models: ModelLibr
     # The points themselves are not in results.json, and the two were made at different times.
     without = [entry.model_copy(update={"points": 0}) for entry in first.detections]
     assert again == first.model_copy(update={"detections": without, "peak_memory_bytes": again.peak_memory_bytes})
+
+
+def test_what_is_uncertain_is_read_back_to_the_last_bit(findings: Findings, models: ModelLibrary) -> None:
+    told = document(findings, models=model_entries(models), parameters=Settings(), seed=3)
+    again = findings_of(schema.Results.model_validate_json(told.to_json()))
+    assert again[1].covariance is None
+    assert again[1].pivot is None
+    np.testing.assert_array_equal(np.array(again[0].covariance), np.array(findings[0].covariance))
+    for mine, theirs in zip(findings, again, strict=True):
+        assert (mine.pivot, mine.unobservable) == (theirs.pivot, theirs.unobservable)
 
 
 def test_poses_read_back_lie_in_memory_as_the_search_makes_them(findings: Findings, models: ModelLibrary) -> None:
@@ -188,6 +205,9 @@ def test_csv_has_a_line_a_detection(tmp_path: Path, findings: Findings, models: 
     assert float(rows[0]["x_m"]) == findings[0].scene_from_model.translation[0]
     assert float(rows[0]["deviation_worst_m"]) == -0.009
     assert rows[1]["deviation_worst_m"] == ""
+    assert float(rows[0]["sigma_m"]) == findings[0].sigma_m
+    assert float(rows[0]["sigma_deg"]) == np.degrees(findings[0].sigma_rad)
+    assert rows[1]["sigma_m"] == rows[1]["sigma_deg"] == ""
 
 
 def test_the_folder_holds_the_models_found(tmp_path: Path, findings: Findings, models: ModelLibrary) -> None:

@@ -16,8 +16,8 @@ from scanfind.kernels.search import draw_firsts, draw_seconds, normal_bit
 from scanfind.moments import MomentGrid
 from scanfind.scene import orientation_grid
 from scanfind.search import bin_pool, wald_table
+from scanfind.self_similar import cube_turns
 from scanfind.surfels import Surfels
-from scanfind.symmetry import cube_turns
 from scanfind.threads import in_threads
 
 Floats = NDArray[np.float64]

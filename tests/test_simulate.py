@@ -16,6 +16,7 @@ from naive_simulate import distances_to, first_hit
 from scanfind.errors import InvalidGeometryError, UsageError
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose, random_rotation
+from scanfind.rays import RayCaster
 from scanfind.simulate import parts
 from scanfind.simulate.objects import (
     CLEARLY_DIFFERENT_M,
@@ -26,7 +27,6 @@ from scanfind.simulate.objects import (
     pipe_spool,
 )
 from scanfind.simulate.placement import surface_points
-from scanfind.simulate.rays import RayCaster
 from scanfind.simulate.scanner import Scanner, SimulatedScan, scan
 from scanfind.simulate.scene import BACKGROUND, Scene, SceneObject
 from scanfind.simulate.scenes import CLUTTER, SHOP_M, shop

@@ -14,10 +14,10 @@ import naive
 from scanfind.cloud import PointChunk, PointCloud
 from scanfind.kernels.blocks import BIAS, fill_hash, find_block, pack_block, unpack_block
 from scanfind.kernels.surfels import smallest_eigenvector
-from scanfind.moments import MomentGrid
+from scanfind.moments import MomentGrid, empty_hash
 from scanfind.scene import GridParameters, Scene, build_scene
 from scanfind.sources import Sources
-from scanfind.surfels import Surfels, empty_hash
+from scanfind.surfels import Surfels
 
 Floats = NDArray[np.float64]
 
@@ -29,8 +29,8 @@ def chunk(xyz: Floats, origin: Floats | None = ORIGIN) -> PointChunk:
     return PointChunk(np.ascontiguousarray(xyz), {}, np.arange(len(xyz)), origin=origin)
 
 
-def grid_of(parts: Sequence[PointChunk], cell: float = CELL, offset: Floats | None = None) -> MomentGrid:
-    grid = MomentGrid(cell, np.zeros(3) if offset is None else offset)
+def grid_of(parts: Sequence[PointChunk], cell: float = CELL, offset: Floats | None = None, jobs: int = 1) -> MomentGrid:
+    grid = MomentGrid(cell, np.zeros(3) if offset is None else offset, jobs)
     for part in parts:
         grid.add(part)
     return grid
@@ -70,12 +70,12 @@ def assert_same_moments(one: MomentGrid, other: MomentGrid) -> None:
 
 def moments_of(grid: MomentGrid) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Address (block, cell, view) and moments of every row, by address."""
-    used = int(grid.counts[0])
-    cells = grid.block_rows[:used]
+    blocks = grid.blocks()
+    cells = grid.block_rows[blocks]
     block, local = np.nonzero(cells >= 0)
     row, found = cells[block, local], []
     while len(row):  # along each cell's chain of views
-        found.append(np.stack([grid.block_keys[:used][block], local, grid.links[row, 0], row], axis=1))
+        found.append(np.stack([grid.block_keys[blocks][block], local, grid.links[row, 0], row], axis=1))
         more = grid.links[row, 1] >= 0
         block, local, row = block[more], local[more], grid.links[row, 1][more]
     every = np.concatenate(found)
@@ -103,7 +103,7 @@ def test_a_hash_finds_what_was_put_in_and_nothing_else(seed: int, count: int, re
     hash_keys, hash_values = empty_hash(len(there))
     assert len(hash_keys) & (len(hash_keys) - 1) == 0
     assert len(hash_keys) >= 2 * len(there)
-    fill_hash(there, hash_keys, hash_values)
+    fill_hash(there, np.arange(len(there)), hash_keys, hash_values)
     assert [find_block(hash_keys, hash_values, key) for key in there] == list(range(len(there)))
     assert all(find_block(hash_keys, hash_values, key) == -1 for key in absent)
 
@@ -120,16 +120,36 @@ def test_chunks_and_order_change_nothing(cuts: list[int], seed: int) -> None:
     pieces = grid_of([chunk(part) for part in np.split(shuffled, sorted(cuts))])
     assert_same_moments(whole, pieces)
     assert_equal(fitted(whole), fitted(pieces))
-    for one, other in zip(whole.depth_maps(), pieces.depth_maps(), strict=True):
-        np.testing.assert_array_equal(one.ranges, other.ranges)
+    for one, other in zip(whole.beams(), pieces.beams(), strict=True):
+        np.testing.assert_array_equal(one.nearest, other.nearest)
 
 
-def test_arrays_grow_without_a_trace() -> None:
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_arrays_grow_without_a_trace(monkeypatch: pytest.MonkeyPatch, jobs: int) -> None:
     # Far more blocks and cells than there is room for at first, in one chunk and in many.
     points = np.random.default_rng(0).uniform(-12, 12, (100_000, 3))
-    whole = grid_of([chunk(points)], 0.1)
-    assert int(whole.counts[0]) > 2048
+    roomy = grid_of([chunk(points)], 0.1)
+    monkeypatch.setattr("scanfind.moments.EMPTY_BLOCKS", 1 << 10)
+    monkeypatch.setattr("scanfind.moments.EMPTY_ROWS", 1 << 14)
+    whole = grid_of([chunk(points)], 0.1, jobs=jobs)
+    assert len(whole.block_keys) > 1 << 10
+    assert len(whole.moments) > 1 << 14
+    assert_same_moments(whole, roomy)
+    assert_same_moments(whole.coarser(), roomy.coarser())
     assert_equal(fitted(whole), fitted(grid_of([chunk(p) for p in np.array_split(points, 7)], 0.1)))
+
+
+@pytest.mark.parametrize("jobs", [2, 3, 8, 20])
+def test_threads_that_share_a_pass_change_nothing(jobs: int) -> None:
+    points, other = bumpy(20_000), bumpy(3000, seed=1)
+    parts = [chunk(points), chunk(other, np.array([1.0, 1.0, 2.0])), chunk(other[::-1])]
+    alone, together = grid_of(parts), grid_of(parts, jobs=jobs)
+    assert_same_moments(alone, together)
+    assert_same_moments(alone.coarser().coarser(), together.coarser().coarser())
+    assert_equal(fitted(alone), fitted(together, jobs=jobs))
+    for one, two in zip(alone.beams(), together.beams(), strict=True):
+        np.testing.assert_array_equal(one.origin, two.origin)
+        np.testing.assert_array_equal(one.nearest, two.nearest)
 
 
 @settings(deadline=None, max_examples=20)
@@ -193,7 +213,7 @@ def test_a_scan_far_away_gives_the_same_surfels(far: tuple[int, int, int]) -> No
     one, other = fitted(here), fitted(there)
     np.testing.assert_array_equal(other.cells.offset - one.cells.offset, shift)
     assert_equal(one, other)
-    np.testing.assert_array_equal(here.depth_maps()[0].ranges, there.depth_maps()[0].ranges)
+    np.testing.assert_array_equal(here.beams()[0].nearest, there.beams()[0].nearest)
 
 
 # ── surfels ──
@@ -280,7 +300,7 @@ def test_without_a_scanner_normals_have_no_side() -> None:
     assert not fitted(grid_of([chunk(points, None)])).signed
     mixed = grid_of([chunk(points), chunk(points, None)])
     assert not fitted(mixed).signed
-    assert len(mixed.depth_maps()) == 1
+    assert len(mixed.beams()) == 1
 
 
 def plate(count: int, thickness: float, turn: Floats) -> tuple[Floats, Floats]:

@@ -8,24 +8,27 @@ from math import comb
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from scanfind.cloud import PointChunk
-from scanfind.depth import LEAST_SPOKEN, DepthMap, joined_until_spoken
+import naive
+from scanfind.cloud import CloudModel, PointChunk
+from scanfind.depth import LEAST_SPOKEN, Beams, DepthMap, joined_until_spoken
+from scanfind.free_space import Limits, caster_of, spoken_of
+from scanfind.kernels.grid import AIM_UNITS, NO_BEAM, RANGE_UNITS, cube_pixel, cube_place, pack_beam, unpack_beam
 from scanfind.library import joint_table
 from scanfind.model import Model, ModelParameters, build_model
 from scanfind.moments import MomentGrid
 from scanfind.parameters import PRESETS
-from scanfind.pose import Pose
+from scanfind.pose import Pose, random_rotation
 from scanfind.recognise import Candidate, Recognition
 from scanfind.refine import Refined
 from scanfind.scene import GridParameters, Scene, build_scene
 from scanfind.search import Hypotheses, model_arrays
 from scanfind.simulate.parts import blocks
 from scanfind.surface import SurfaceParameters
-from scanfind.verify import distinct, spread
+from scanfind.verify import distinct, gather_support, spread
 
 Floats = NDArray[np.float64]
 
@@ -71,26 +74,28 @@ def weigh(place: tuple[float, float, float], turn: Floats | None = None, known: 
     return found.candidates(Refined(pose, np.eye(6)[None], np.ones(1), np.zeros(1)))[0]
 
 
-def facing(place: tuple[float, float, float]) -> int:
-    """How many samples of a box there face the scanner well enough to return a beam."""
+def facing_area(place: tuple[float, float, float]) -> float:
+    """Surface of a box there that faces the scanner well enough to return a beam, m²."""
     points, normals = box().samples.points + np.array(place), box().samples.normals
     towards = -(points * normals).sum(axis=1) / np.linalg.norm(points, axis=1)
-    return int(np.count_nonzero(towards >= PARAMETERS.verify.least_facing))
+    return float((towards >= PARAMETERS.verify.least_facing).mean()) * 6.0 * BOX_M**2
 
 
 ON_THE_BOX = (BOX_AT, 0.0, 0.0)
+# A pixel on an outline counts whole or not at all, and a beam that passed near one says nothing.
+NEARLY = 0.2
 
 
 def test_on_the_box_its_front_is_supported_and_nothing_seen_through() -> None:
     seen = weigh(ON_THE_BOX).evidence
     front = np.count_nonzero(box().samples.normals[:, 0] < -0.9)
     assert seen.samples == len(box().samples)
-    assert seen.seen_through == 0
     # The outermost cells have too few neighbours for a normal.
     assert 0.85 * front <= seen.supported <= front
-    assert seen.supported + seen.hidden <= facing(ON_THE_BOX)
+    assert seen.spoken.on == pytest.approx(BOX_M**2, rel=0.02)
+    assert seen.spoken.beside == seen.spoken.through == seen.spoken.hidden == 0.0
     assert seen.rms < 1e-4
-    assert seen.visible_support() == 1.0
+    assert (seen.visible_support(), seen.penalty()) == (1.0, 0.0)
     assert seen.support() == seen.supported / seen.samples
     assert (np.diff(seen.claims) > 0).all()
     claimed = scene(True).fine.means[seen.claims]
@@ -100,31 +105,38 @@ def test_on_the_box_its_front_is_supported_and_nothing_seen_through() -> None:
 @pytest.mark.parametrize("place", [(2.0, 0.7, 0.0), (2.5, -0.9, 0.5), (1.0, 0.0, 0.0), (3.2, 1.0, -1.0)])
 def test_in_free_space_all_that_faces_the_scanner_is_seen_through(place: tuple[float, float, float]) -> None:
     seen = weigh(place).evidence
-    assert seen.seen_through == facing(place) > 0
-    assert (seen.supported, seen.hidden) == (0, 0)
-    assert seen.penalty() == seen.seen_through / seen.samples
-    assert seen.visible_support() == 0.0
+    assert seen.spoken.through == pytest.approx(facing_area(place), rel=NEARLY)
+    assert (seen.supported, seen.spoken.on, seen.spoken.beside, seen.spoken.hidden) == (0, 0.0, 0.0, 0.0)
+    assert (seen.visible_support(), seen.penalty()) == (0.0, 1.0)
 
 
 @pytest.mark.parametrize("place", [(5.0, 0.0, 0.0), (6.0, 1.0, -1.0), (2.6, 0.0, 0.0)])
 def test_behind_something_it_is_hidden(place: tuple[float, float, float]) -> None:
     # The last is behind the box, in its shadow as seen from the scanner.
     seen = weigh(place).evidence
-    assert seen.hidden == facing(place) > 0
-    assert (seen.supported, seen.seen_through) == (0, 0)
+    assert seen.spoken.hidden == pytest.approx(facing_area(place), rel=NEARLY)
+    assert (seen.supported, seen.spoken.on, seen.spoken.beside, seen.spoken.through) == (0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("off", [0.015, -0.015])
+def test_a_little_before_or_behind_what_is_there_it_is_beside(off: float) -> None:
+    # Farther off than noise, nearer than what a beam must go on to have passed through.
+    seen = weigh((BOX_AT + off, 0.0, 0.0)).evidence
+    assert seen.spoken.beside == pytest.approx(BOX_M**2, rel=0.05)
+    assert (seen.spoken.on, seen.spoken.through, seen.spoken.hidden) == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("place", [(2.0, 3.0, 0.0), (-3.0, 0.0, 0.0), (0.5, 0.0, 5.0)])
 def test_where_nobody_looked_there_is_no_evidence(place: tuple[float, float, float]) -> None:
     seen = weigh(place).evidence
-    assert (seen.supported, seen.seen_through, seen.hidden) == (0, 0, 0)
-    assert seen.visible_support() == 0.0
+    assert (seen.supported, sum(seen.spoken)) == (0, 0.0)
+    assert (seen.visible_support(), seen.penalty()) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("place", [ON_THE_BOX, (2.0, 0.7, 0.0), (5.0, 0.0, 0.0)])
-def test_without_a_scanner_nothing_is_seen_through_or_hidden(place: tuple[float, float, float]) -> None:
+def test_without_a_scanner_beams_say_nothing(place: tuple[float, float, float]) -> None:
     blind, known = weigh(place, known=False), weigh(place)
-    assert (blind.evidence.seen_through, blind.evidence.hidden) == (0, 0)
+    assert sum(blind.evidence.spoken) == 0.0
     # Sides nobody knows: a back may lie on the scene as well, never fewer samples.
     assert blind.evidence.supported >= known.evidence.supported
 
@@ -133,7 +145,107 @@ def test_flush_with_the_wall_its_front_is_supported() -> None:
     seen = weigh((WALL_AT + BOX_M / 2, 0.8, 0.3)).evidence
     front = np.count_nonzero(box().samples.normals[:, 0] < -0.9)
     assert seen.supported == front
-    assert seen.seen_through == 0
+    assert seen.spoken.on == pytest.approx(BOX_M**2, rel=0.02)
+    assert seen.spoken.beside == seen.spoken.through == 0.0
+
+
+# ── beams ──
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    *[st.floats(-1.0, 1.0)] * 3, st.floats(0.01, 1e4), st.sampled_from([45, 360]), st.sampled_from([0, 1, 2]),
+    st.booleans(),
+)  # fmt: skip
+def test_a_beam_is_kept_to_a_hair(
+    x: float, y: float, z: float, distance: float, edge: int, major: int, back: bool
+) -> None:
+    way = np.array([x, y, z])
+    way[major] = -1.0 if back else 1.0
+    way /= np.linalg.norm(way)
+    pixel, packed = pack_beam(*cube_place(*way), edge, distance)
+    assert pixel == cube_pixel(*way, edge)
+    assert 0 <= packed < NO_BEAM
+    *kept, far, angle = unpack_beam(pixel, packed, edge)
+    assert abs(far - distance) <= 1.0 / RANGE_UNITS
+    assert np.linalg.norm(kept - way) <= 2.0 / edge / AIM_UNITS
+    assert np.linalg.norm(kept) == pytest.approx(1.0)
+    assert 0.0 < angle <= 4.0 / edge**2
+    nearer = pack_beam(*cube_place(*way), edge, distance - 0.01 * distance - 1e-3)[1]
+    assert nearer < packed or distance < 1e-3
+
+
+def test_the_pixels_of_a_map_fill_the_sphere() -> None:
+    angles = [unpack_beam(pixel, 0, 45)[4] for pixel in range(6 * 45**2)]
+    assert sum(angles) == pytest.approx(4.0 * np.pi, rel=1e-3)
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.integers(0, 2**32))
+def test_what_beams_say_is_what_plain_rays_say(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    centre = np.array([2.0, 0.0, 0.0]) + rng.uniform(-0.6, 0.6, 3)
+    placed = Pose(random_rotation(rng), centre)
+    limits = Limits(0.01, 0.05, 0.25)
+    beams = beams_about(np.zeros(3), rng.permutation(points_seen())[:300])
+    told = spoken_of(box(), caster_of(box()), placed, [beams], limits)
+    expected = naive.spoken(placed.move(corners_of(box())), points_of(beams), limits)
+    np.testing.assert_allclose(told, expected, rtol=1e-3, atol=1e-9)
+
+
+def test_moving_everything_changes_nothing_a_beam_says() -> None:
+    moved = Pose.from_rotation_vector(np.array([0.3, -1.0, 2.0]), np.array([10.0, -7.0, 3.0]))
+    placed, limits = Pose(np.eye(3), np.array([2.1, 0.15, 0.1])), Limits(0.01, 0.05, 0.25)
+    points = points_seen()
+    here = spoken_of(box(), caster_of(box()), placed, [beams_about(np.zeros(3), points)], limits)
+    there = beams_about(moved.translation, moved.move(points))
+    told = spoken_of(box(), caster_of(box()), moved @ placed, [there], limits)
+    # Other pixels hold other beams.
+    np.testing.assert_allclose(told, here, rtol=0.15, atol=0.006)
+    assert min(here.hidden, here.through) > 0.01
+
+
+def test_of_more_beams_than_needed_a_share_says_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    placed, limits = Pose(np.eye(3), np.array([2.1, 0.15, 0.1])), Limits(0.01, 0.05, 0.25)
+    beams = [beams_about(np.zeros(3), points_seen())]
+    every = spoken_of(box(), caster_of(box()), placed, beams, limits)
+    monkeypatch.setattr("scanfind.free_space.MOST_BEAMS", 500)
+    some = spoken_of(box(), caster_of(box()), placed, beams, limits)
+    assert some != every
+    np.testing.assert_allclose(some, every, rtol=0, atol=0.1 * sum(every))
+
+
+def test_a_piece_of_scan_is_met_as_the_surface_it_was_cut_from() -> None:
+    rng = np.random.default_rng(0)
+    sphere = rng.normal(size=(40_000, 3))
+    sphere *= 0.5 / np.linalg.norm(sphere, axis=1, keepdims=True)
+    model = build_model(CloudModel("ball", sphere, "", np.array([9.0, 0.0, 0.0])), ModelParameters())
+    ways = rng.normal(size=(2000, 3))
+    hits = caster_of(model).shoot(np.zeros(3), ways / np.linalg.norm(ways, axis=1, keepdims=True))
+    met = np.isfinite(hits.distance)
+    assert met.mean() > 0.35  # between the squares there is nothing to meet
+    np.testing.assert_allclose(hits.distance[met], 0.5, rtol=0, atol=0.5 * model.spacing)
+
+
+def beams_about(origin: Floats, points: Floats) -> Beams:
+    """What a scanner would keep of points it saw, (N, 3)."""
+    nearest = np.full(6 * 360**2, NO_BEAM)
+    for way in points - origin:
+        pixel, packed = pack_beam(*cube_place(*way), 360, float(np.linalg.norm(way)))
+        nearest[pixel] = min(nearest[pixel], packed)
+    return Beams(origin, nearest, 360)
+
+
+def points_of(beams: Beams) -> tuple[Floats, Floats]:
+    """Where beams ended, (B, 3), and the solid angles of their pixels (B,)."""
+    found = [unpack_beam(k, beams.nearest[k], beams.edge) for k in np.flatnonzero(beams.nearest < NO_BEAM)]
+    return np.array([np.array(way) * far for *way, far, _ in found]), np.array([angle for *_, angle in found])
+
+
+def corners_of(model: Model) -> Floats:
+    """(F, 3, 3)."""
+    assert model.mesh is not None
+    return model.mesh.triangles()
 
 
 def test_evidence_is_each_pose_s_own() -> None:
@@ -195,8 +307,11 @@ def weigh_in(found: Recognition) -> tuple[float, float]:
     """Support of the box where it is, with and without the coarse level."""
     pose = Hypotheses(np.zeros(1, np.int64), np.eye(3)[None], np.array([ON_THE_BOX]), np.ones(1))
     found._fit_near(pose, 2)
-    both, fine = found._evidence(pose, found._fine, found._thin), found._evidence(pose, found._fine)
-    return both[0].support(), fine[0].support()
+    (both,), (fine,) = (
+        gather_support(pose, found.scene, found._fine, thin, found.arrays, found.signed, PARAMETERS.verify, 1)
+        for thin in (found._thin, None)
+    )
+    return both.supported / both.samples, fine.supported / fine.samples
 
 
 @cache

@@ -25,7 +25,7 @@ Mask = NDArray[np.bool_]
 # 4.2.1: "the constant number of points in the Model"; Tables 5 and 6: 20,000 points in the scene are a ratio of 2.
 MODEL_POINTS = 10_000
 # The paper calls a transformation correct without a number. Ours: the centre within 10 mm, the rotation within 0.5°.
-# Neither object is symmetric: the poses a frame is mistaken for are half a turn off.
+# Neither object has a symmetry: the poses a frame is mistaken for are half a turn off.
 RIGHT_MM, RIGHT_DEG = 10.0, 0.5
 # Farther from everything than this and a point counts as this far.
 FARTHEST_M = 1.0

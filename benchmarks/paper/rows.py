@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common import PoseError, centre_of, origin_lines, pose_error, write_rows
+from benchmarks.common import PoseError, origin_lines, pose_error, symmetry_of, write_rows
 from benchmarks.paper.definitions import (
     FARTHEST_M,
     is_right,
@@ -21,7 +21,6 @@ from benchmarks.paper.definitions import (
 from benchmarks.paper.experiments import Case, Key
 from benchmarks.paper.systems import Answer, surface_of
 from scanfind.errors import UsageError
-from scanfind.mesh import Mesh
 from scanfind.pose import Pose
 
 NAN = float("nan")
@@ -118,11 +117,11 @@ def judged(case: Case, system: str, answer: Answer) -> Row:
 
 
 def error_of(pose: Pose, case: Case) -> PoseError:
-    """How far a pose is from the truth, at the middle of the model's box."""
-    centre = centre_of(case.model.vertices if isinstance(case.model, Mesh) else case.model.points)
+    """How far a pose is from the truth, turning the model onto itself left out."""
+    symmetry = symmetry_of(case.model)
     truth = case.cloud.truth
     truths = [truth] if case.turn is None else [truth, truth @ case.turn]
-    return min((pose_error(pose, one, centre) for one in truths), key=lambda error: (error.deg, error.mm))
+    return min((pose_error(pose, one, symmetry) for one in truths), key=lambda error: (error.deg, error.mm))
 
 
 def why(case: Case, answer: Answer) -> str:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from scanfind.pose import Pose
     from scanfind.results import read_results, write_results
     from scanfind.scans import read_scan, scan_info
+    from scanfind.symmetry import Symmetry, pose_error
 
     __version__: str
 
@@ -42,9 +43,11 @@ __all__ = [
     "PointCloud",
     "Pose",
     "ScanfindError",
+    "Symmetry",
     "__version__",
     "find",
     "isolate",
+    "pose_error",
     "read_models",
     "read_results",
     "read_scan",
@@ -70,6 +73,8 @@ _HOME = {
     "write_results": "results",
     "read_scan": "scans",
     "scan_info": "scans",
+    "Symmetry": "symmetry",
+    "pose_error": "symmetry",
 }
 
 

@@ -13,7 +13,7 @@ from scanfind.clock import Clock, say_if_compiling, watched
 from scanfind.detection import Findings
 from scanfind.document import findings_of
 from scanfind.errors import UsageError
-from scanfind.find import with_points
+from scanfind.find import surfaces_of, with_points
 from scanfind.library import ModelLibrary
 from scanfind.results import MODELS, fill_folder, open_remainder, read_results, result_folder
 from scanfind.sources import Sources
@@ -59,7 +59,8 @@ def isolate_again(
             say_if_compiling(tell)
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
             # Of the whole model as designed, also where the search fitted its parts one by one.
-            findings = Findings(with_points(found, models.models(), {}, chunks, within, rest, available_cores()))
+            surfaces = surfaces_of(found, models.models(), within)
+            findings = Findings(with_points(found, surfaces, {}, chunks, within, rest, available_cores()))
         findings.refused, findings.notes = found.refused, found.notes
         findings.shift, findings.crs, findings.tolerance_m = found.shift, found.crs, within
         # Where the scanner stood may have been told to the search by hand.

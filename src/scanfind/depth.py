@@ -17,6 +17,25 @@ ENOUGH_AROUND = 3  # of a pixel and the four beside it must be filled for a samp
 LOOKED_AT = 45  # patches along an edge, of 2°: one with any range in it was looked at
 
 
+class Beams(NamedTuple):
+    """The nearest beam that came back from each direction, exactly: beside which pixel it went tells what it missed.
+
+    origin : (3,) where the scanner stood, relative to the grid's offset
+    nearest : (6 · edge²,) int64, range and aim (kernels.grid.pack_beam), NO_BEAM where none came back
+    """
+
+    origin: Floats
+    nearest: NDArray[np.int64]
+    edge: int
+
+    def ranges(self) -> DepthMap:
+        """How far they went, and no more."""
+        from scanfind.kernels.grid import NO_BEAM, RANGE_UNITS
+
+        ranges = np.where(self.nearest < NO_BEAM, (self.nearest >> 16) / RANGE_UNITS, np.inf)
+        return DepthMap(self.origin, ranges.astype(np.float32), self.edge)
+
+
 class DepthMap(NamedTuple):
     """The nearest surface seen from one scanner position in each direction.
 

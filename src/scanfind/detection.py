@@ -20,16 +20,19 @@ OFF_M = 0.003
 
 @dataclass(frozen=True)
 class Motion:
-    """A rigid motion the data do not fix, in the model's frame: turning about a line, or sliding along it.
+    """A rigid motion the data do not fix, or hardly, in the model's frame: turning about a line, or sliding along it.
 
     kind : "slide" or "roll" (a screw is reported as the one it mostly is)
     axis : unit direction in the model's frame
     through : a point on the axis, model frame, metres (for a slide: the model's centre)
+    sigma : of a motion fixed no better than a single point is measured: its standard deviation, metres for a slide,
+        radians for a roll; None where the data say nothing at all
     """
 
     kind: str
     axis: tuple[float, float, float]
     through: tuple[float, float, float]
+    sigma: float | None = None
 
 
 @dataclass(frozen=True)
@@ -104,11 +107,15 @@ class Detection:
     scene_from_model : in the scan file's own frame, metres
     score : 0 … 1, how much the evidence speaks for it (see `verify`)
     support : share of the model's surface samples that lie on the scene (the paper's λs = m_s / m)
-    visible_support : the same among those samples a scanner could see: supported / (supported + seen through)
-    penalty : share of samples through which a beam passed (Papazov & Burschka 2010); 0 without origins
+    visible_support : share of the surface the scanners' beams speak of that they ended on; 0 without origins
+    penalty : share of the surface beams went to through which they passed (Papazov & Burschka 2010); 0 without origins
     coverage : share of the model's surface the scan shows, 0 … 1
     rms_m : root mean square distance of supported samples to the scene's surface
-    unobservable : motions the data do not fix
+    unobservable : motions the data do not fix, or hardly
+    covariance : (6, 6) of the pose's error (rotation vector, translation of the pivot) in the scene's axes, rad and m:
+        the true pose turns the found one about the pivot, then shifts it. It says nothing (is zero) along the motions
+        of `unobservable` without a sigma. None in results of a version that had none
+    pivot : (3,) the point the covariance is about, in the middle of the placed model, scene frame, metres
     parts : of an assembly, each measured by itself; empty where that was not asked for or it has but one
     """
 
@@ -124,7 +131,19 @@ class Detection:
     unobservable: tuple[Motion, ...] = ()
     isolated: IsolatedPoints | None = None
     deviation: Deviation | None = None
+    covariance: Floats | None = None
+    pivot: tuple[float, float, float] | None = None
     parts: tuple[PartFit, ...] = ()
+
+    @property
+    def sigma_m(self) -> float:
+        """How far the pivot is from where it truly is, root mean square, metres; NaN without a covariance."""
+        return float("nan") if self.covariance is None else float(np.sqrt(np.trace(self.covariance[3:, 3:])))
+
+    @property
+    def sigma_rad(self) -> float:
+        """By what angle the rotation is off, root mean square, radians; NaN without a covariance."""
+        return float("nan") if self.covariance is None else float(np.sqrt(np.trace(self.covariance[:3, :3])))
 
     def with_points(self, isolated: IsolatedPoints, deviation: Deviation | None) -> Detection:
         """The same detection with its isolated points."""

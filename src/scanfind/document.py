@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic_core import to_jsonable_python
 
 from scanfind import schema
@@ -20,6 +21,7 @@ from scanfind.pose import Pose
 
 if TYPE_CHECKING:
     from scanfind.library import ModelLibrary
+    from scanfind.symmetry import Symmetry
 
 # Both ends of a file and its length: a GB is told apart from another in milliseconds, not in seconds.
 FINGERPRINT_BLOCK = 1 << 20
@@ -85,9 +87,24 @@ def findings_of(results: schema.Results) -> Findings:
 def model_entries(models: ModelLibrary) -> list[schema.ModelEntry]:
     """What a library holds, as results.json has it."""
     return [
-        schema.ModelEntry(name=model.name, sha256=model.sha256, diameter_m=model.diameter, pairs=model.pairs)
+        schema.ModelEntry(
+            name=model.name,
+            sha256=model.sha256,
+            diameter_m=model.diameter,
+            pairs=model.pairs,
+            symmetry=symmetry_entry(model.symmetry),
+        )
         for model in models.show()
     ]
+
+
+def symmetry_entry(symmetry: Symmetry) -> schema.SymmetryEntry:
+    """A model's symmetry, as results.json has it."""
+    return schema.SymmetryEntry(
+        words=symmetry.words(),
+        centre_m=_vector(symmetry.centre),
+        axes=[schema.AxisEntry(direction=axis.direction, order=axis.order or None) for axis in symmetry.axes],
+    )
 
 
 def fingerprint(path: Path) -> str | None:
@@ -136,12 +153,12 @@ def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -
         isolated=isolated,
         pose=pose,
         deviation=None if deviation is None else _deviation_entry(deviation),
+        covariance=None if found.covariance is None else _covariance(found.covariance),
+        pivot_m=found.pivot,
+        sigma_m=_or_none(found.sigma_m),
+        sigma_rad=_or_none(found.sigma_rad),
         parts=[_part_entry(part) for part in found.parts],
     )
-
-
-def _motion_entry(motion: Motion) -> schema.MotionEntry:
-    return schema.MotionEntry(kind=motion.kind, axis=motion.axis, through_m=motion.through)
 
 
 def _part_entry(part: PartFit) -> schema.PartEntry:
@@ -162,6 +179,15 @@ def _part_entry(part: PartFit) -> schema.PartEntry:
         visible_support=_or_none(part.visible_support),
         penalty=_or_none(part.penalty),
     )
+
+
+def _motion_entry(motion: Motion) -> schema.MotionEntry:
+    return schema.MotionEntry(kind=motion.kind, axis=motion.axis, through_m=motion.through, sigma=motion.sigma)
+
+
+def _covariance(matrix: NDArray[np.float64]) -> schema.Covariance:
+    a, b, c, d, e, f = (tuple(row) for row in matrix.tolist())
+    return a, b, c, d, e, f
 
 
 def _deviation_entry(deviation: Deviation) -> schema.DeviationEntry:
@@ -214,12 +240,14 @@ def _detection(entry: schema.DetectionEntry) -> Detection:
         rms_m=_or_nan(entry.rms_m),
         unobservable=_motions(entry.unobservable),
         deviation=None if deviation is None else Deviation(*map(_or_nan, deviation.model_dump().values())),
+        covariance=None if entry.covariance is None else np.array(entry.covariance),
+        pivot=entry.pivot_m,
         parts=tuple(_part(part) for part in entry.parts),
     )
 
 
 def _motions(entries: Iterable[schema.MotionEntry]) -> tuple[Motion, ...]:
-    return tuple(Motion(entry.kind, entry.axis, entry.through_m) for entry in entries)
+    return tuple(Motion(entry.kind, entry.axis, entry.through_m, entry.sigma) for entry in entries)
 
 
 def _part(entry: schema.PartEntry) -> PartFit:

@@ -24,6 +24,7 @@ from scanfind.model import Model, ModelParameters
 from scanfind.moments import MomentGrid
 from scanfind.near_surface import near_model, near_triangles
 from scanfind.parameters import PRESETS, IsolationParameters, Parameters
+from scanfind.polish import polished
 from scanfind.pose import Pose
 from scanfind.recognise import Recognition
 from scanfind.scene import build_scene, first_cell
@@ -32,6 +33,7 @@ from scanfind.threads import available_cores
 
 if TYPE_CHECKING:
     from scanfind.detection import Detection
+    from scanfind.kernels.distance import NearSurface
     from scanfind.progress import Progress
     from scanfind.scans import CloudWriter
 
@@ -104,16 +106,23 @@ def find(
 
     findings.extend(found.detections())
     findings.refused = found.refused()
-    if isolate and (built := found.built()):
+    if isolate and (parts := found.built()):
         with clock("isolate"):  # each part by its own raw points, in a pass of its own: where they are decides 3.5
-            around = near_parts(built, watched(sources.chunks(), clock, tell, "isolate", sources.expected()), jobs)
+            around = near_parts(parts, watched(sources.chunks(), clock, tell, "isolate", sources.expected()), jobs)
             findings[:] = [found.measured(one, around.get(one.id)) for one in findings]
     if isolate and (findings or remainder is not None):
         with clock("isolate"):  # 3.5 isolation: the second pass
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
             tolerance = isolation_tolerance(parameters.isolate, found.noise(), scene.fine.cell)
             findings.tolerance_m = tolerance
-            findings[:] = with_points(findings, library, found.built(), chunks, tolerance, remainder, jobs)
+            surfaces = surfaces_of(findings, library, tolerance)
+            built = {number: as_built(number, faces, tolerance) for number, faces in found.built().items()}
+            findings[:] = with_points(findings, surfaces, built, chunks, tolerance, remainder, jobs)
+        with clock("refine"):  # 3.4 once more, on the raw points: the exact surface, and how uncertain the pose is
+            # Parts were fitted to the raw points before.
+            findings[:] = [
+                one if one.parts else polished(one, surfaces[one.model], parameters.refine, jobs) for one in findings
+            ]
     findings.scans = [source.told() for source in sources.all]
     findings.crs, findings.notes = sources.crs(), found.notes()
     findings.shift = tuple(shift_for(scene.fine.cells.offset).tolist())
@@ -169,25 +178,22 @@ def isolation_tolerance(parameters: IsolationParameters, noise: float, cell: flo
     return min(max(parameters.noises * noise, 0.1 * cell), 0.5 * cell)
 
 
+def surfaces_of(findings: Sequence[Detection], library: Sequence[Model], tolerance: float) -> dict[str, NearSurface]:
+    """The surface of each model found, to be asked for distances up to `tolerance`, metres."""
+    names = {found.model for found in findings}
+    return {model.name: near_model(model, tolerance) for model in library if model.name in names}
+
+
 def with_points(
-    findings: Sequence[Detection], library: Sequence[Model], built: Mapping[int, Floats],
+    findings: Sequence[Detection], surfaces: Mapping[str, NearSurface], built: Mapping[int, Placed],
     chunks: Iterable[PointChunk], tolerance: float, remainder: CloudWriter | None, jobs: int,
 ) -> list[Detection]:  # fmt: skip
     """Each detection with its raw points and how far they are from its model.
 
-    built : the faces (F, 3, 3) of detections fitted in parts, by id, scan frame: what their points are cut and
-        measured by
+    built : by id, the surface of those fitted in parts, as built: what their points are cut and measured by
     """
-    surfaces = {
-        model.name: near_model(model, tolerance)
-        for model in library
-        if any(found.model == model.name for found in findings)
-    }
     placed = [
-        as_built(found.id, built[found.id], tolerance)
-        if found.id in built
-        else Placed(found.id, surfaces[found.model], found.scene_from_model)
-        for found in findings
+        built.get(found.id) or Placed(found.id, surfaces[found.model], found.scene_from_model) for found in findings
     ]
     rest = None if remainder is None else lambda chunk: write_rest(remainder, chunk)
     points = isolate_raw(chunks, placed, IsolateParameters(tolerance), remainder=rest, jobs=jobs)

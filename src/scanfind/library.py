@@ -20,8 +20,10 @@ from scanfind.mesh import Mesh, Placement
 from scanfind.model import DEFAULTS, Model, ModelParameters, ModelSummary, build_model, model_hash
 from scanfind.pairs import PairParameters, PairTable, key_count
 from scanfind.pose import Pose
+from scanfind.self_similar import Similar
 from scanfind.store import Record, Store
 from scanfind.surface import SurfaceParameters
+from scanfind.symmetry import Axis, Symmetry
 
 __all__ = ["JointTable", "Model", "ModelLibrary", "ModelParameters", "ModelSummary", "joint_table"]
 
@@ -180,8 +182,9 @@ class ModelLibrary:
                 int(facts["pairs"]),
                 int(facts["triangles"]),
                 len(facts["placements"]),
+                _symmetry(facts["symmetry"]),
             )
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, ScanfindError):
             self._store.damaged(f"model {record.name!r}")
 
 
@@ -201,25 +204,37 @@ def _facts(model: Model) -> dict[str, Any]:
         "pairs": len(model.pairs.keys),
         "triangles": len(model.mesh.faces) if model.mesh else 0,
         "parameters": asdict(model.parameters),
+        "symmetry": {"centre": model.symmetry.centre.tolist(), "axes": model.symmetry.axes},
+        "similar": [{"overlap": each.overlap, **_pose_facts(each.motion)} for each in model.similar],
         "placements": [_placement_facts(placement) for placement in model.placements],
         "parts": list(model.mesh.notes.get("parts", ())) if model.mesh else [],
     }
 
 
 def _placement_facts(placement: Placement) -> dict[str, Any]:
-    pose = placement.design_from_model
     return {
         "global_id": placement.global_id,
         "ifc_class": placement.ifc_class,
         "name": placement.name,
-        "rotation": pose.rotation.tolist(),
-        "translation": pose.translation.tolist(),
+        **_pose_facts(placement.design_from_model),
     }
 
 
+def _pose_facts(pose: Pose) -> dict[str, Any]:
+    return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
+
+
+def _pose(facts: Mapping[str, Any]) -> Pose:
+    return Pose(np.array(facts["rotation"], np.float64), np.array(facts["translation"], np.float64))
+
+
+def _symmetry(facts: Mapping[str, Any]) -> Symmetry:
+    axes = [Axis((float(x), float(y), float(z)), int(order)) for (x, y, z), order in facts["axes"]]
+    return Symmetry(np.array(facts["centre"], np.float64), tuple(axes))
+
+
 def _placement(facts: Mapping[str, Any]) -> Placement:
-    pose = Pose(np.array(facts["rotation"], np.float64), np.array(facts["translation"], np.float64))
-    return Placement(facts["global_id"], facts["ifc_class"], facts["name"], pose)
+    return Placement(facts["global_id"], facts["ifc_class"], facts["name"], _pose(facts))
 
 
 def _arrays(model: Model) -> dict[str, NDArray[Any]]:
@@ -243,7 +258,9 @@ def _model(record: Record, arrays: Mapping[str, NDArray[Any]]) -> Model:
     facts = record.facts
     surface, pairs = facts["parameters"]["surface"], facts["parameters"]["pairs"]
     parameters = ModelParameters(
-        SurfaceParameters(**surface), PairParameters(**{**pairs, "distances": tuple(pairs["distances"])})
+        SurfaceParameters(**surface),
+        PairParameters(**{**pairs, "distances": tuple(pairs["distances"])}),
+        facts["parameters"]["symmetry"],
     )
     placements = tuple(_placement(placement) for placement in facts["placements"])
     mesh = cloud = None
@@ -274,6 +291,8 @@ def _model(record: Record, arrays: Mapping[str, NDArray[Any]]) -> Model:
         mesh=mesh,
         cloud=cloud,
         pairs=PairTable(keys, *ends),
+        symmetry=_symmetry(facts["symmetry"]),
+        similar=tuple(Similar(float(each["overlap"]), _pose(each)) for each in facts["similar"]),
         placements=placements,
         parameters=parameters,
     )

@@ -12,8 +12,12 @@ import numpy as np
 from scanfind.cloud import CloudModel, OrientedCloud
 from scanfind.cloud_surface import sample_cloud
 from scanfind.mesh import Mesh, Placement
+from scanfind.onto_itself import OntoItself
 from scanfind.pairs import PairParameters, PairTable, build_pairs
+from scanfind.self_similar import Similar, find_similar
 from scanfind.surface import SurfaceParameters, sample_mesh
+from scanfind.symmetries import declared_symmetry, find_symmetry
+from scanfind.symmetry import Symmetry, parse_axes
 
 # Part of every model's hash: raise it when the samples or pairs of one and the same model come out differently.
 RECIPE = "scanfind model, recipe 1"
@@ -21,10 +25,18 @@ RECIPE = "scanfind model, recipe 1"
 
 @dataclass(frozen=True)
 class ModelParameters:
-    """How a model is prepared for the search."""
+    """How a model is prepared for the search.
+
+    symmetry : axes of the model with their order, such as "x2", "z4,x2" or "z*" (every angle), or "none"; None: found
+    """
 
     surface: SurfaceParameters = field(default_factory=SurfaceParameters)
     pairs: PairParameters = field(default_factory=PairParameters)
+    symmetry: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.symmetry is not None:
+            parse_axes(self.symmetry)
 
 
 DEFAULTS = ModelParameters()
@@ -42,6 +54,8 @@ class Model:
     mesh : the triangles, for isolation; None for a model that is a piece of scan
     cloud : that piece of scan; None for a mesh
     pairs : the oriented pairs of the samples with their keys
+    symmetry : the rotations after which no scan could tell that it was turned
+    similar : motions after which it could be taken for itself, though it is not, likeliest first
     placements : the design's products of this geometry
     """
 
@@ -55,6 +69,8 @@ class Model:
     mesh: Mesh | None
     cloud: CloudModel | None
     pairs: PairTable
+    symmetry: Symmetry
+    similar: tuple[Similar, ...]
     placements: tuple[Placement, ...]
     parameters: ModelParameters
 
@@ -70,6 +86,7 @@ class ModelSummary(NamedTuple):
     pairs: int
     triangles: int
     placements: int
+    symmetry: Symmetry
 
 
 def model_hash(model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS) -> str:
@@ -98,6 +115,9 @@ def build_model(model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS
     else:
         surface = sample_cloud(model, parameters.surface)
         mesh, cloud = None, model
+    itself = OntoItself(surface, mesh)
+    declared = parameters.symmetry
+    symmetry = find_symmetry(itself) if declared is None else declared_symmetry(itself, parse_axes(declared))
     return Model(
         name=model.name,
         sha256=model_hash(model, parameters),
@@ -109,6 +129,8 @@ def build_model(model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS
         mesh=mesh,
         cloud=cloud,
         pairs=build_pairs(surface.samples, surface.diameter, surface.spacing, parameters.pairs),
+        symmetry=symmetry,
+        similar=find_similar(itself, symmetry),
         placements=mesh.placements if mesh else (),
         parameters=parameters,
     )

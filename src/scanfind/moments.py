@@ -6,22 +6,29 @@ their pooled covariance its normals by PCA (3.2); moments add, so levels, chunks
 
 from __future__ import annotations
 
-from mmap import mmap
-from typing import Any
+import mmap
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.cloud import PointChunk
-from scanfind.depth import DEPTH_PIXELS, DepthMap, joined_until_spoken
+from scanfind.depth import DEPTH_PIXELS, Beams
 from scanfind.threads import side_by_side
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+# Of one shard, as the kernels of the pass take them: its hash table, the arrays all share, its counts.
+Arrays: TypeAlias = tuple[NDArray[Any], ...]
 
 # Room to begin with: 134 MB and 470 MB of addresses, of which only what is written becomes memory. From 2^14 and 2^20
 # on, doubling took 0.9 s of a pass over 10 M points that needs 0.8 s.
 EMPTY_BLOCKS, EMPTY_ROWS = 1 << 16, 1 << 22
+MOST_SHARDS = 8  # each reads all points, and a thread that adds a tenth of them gains nothing any more
+WORTH_A_THREAD = 1000  # points or blocks: fewer are added sooner than a thread is started
 POINTS_TO_SETTLE = 1000  # of which the median says where the scan lies
 
 
@@ -32,13 +39,13 @@ class MomentGrid:
     the first points, rounded to whole metres, so that coordinates keep their digits however far from zero the scan is).
     jobs : threads
 
-    points : added so far; unaddressable : those too far from the rest to be in a cell
+    points : added so far
     signed : every chunk said where its scanner stood
     units : offset units a cell
-    hash_keys, hash_values : packed block coordinates → block
-    block_keys : (blocks,) packed; block_rows : (blocks, 512) a row of each cell's moments, -1 for an empty cell
+    block_keys : (blocks,) packed, -1 where none lies
+    block_rows : (blocks, 512) a row of each cell's moments, -1 for an empty cell
     moments : (rows, 13) for each cell and view; links : (rows, 2) the row's view, and the cell's next row or -1
-    counts : blocks and rows in use; what lies behind them in the arrays is room to grow
+    counts : (shards, 3) blocks and rows in use, and points left out; see kernels.grid.place_of for where they lie
     """
 
     def __init__(self, cell: float, offset: Floats | None = None, jobs: int = 1) -> None:
@@ -47,19 +54,23 @@ class MomentGrid:
         self.cell = cell
         self.offset = offset
         self.points = 0
-        self.unaddressable = 0
         self.signed = True
         self.units = OFFSET_UNITS
-        self.hash_keys = np.full(4 * EMPTY_BLOCKS, -1, np.int64)
-        self.hash_values = np.zeros(4 * EMPTY_BLOCKS, np.int32)
-        self.block_keys = np.empty(EMPTY_BLOCKS, np.int64)
+        self.block_keys = np.full(EMPTY_BLOCKS, -1, np.int64)
         self.block_rows = room((EMPTY_BLOCKS, 512), np.dtype(np.int32))
         self.moments = room((EMPTY_ROWS, MOMENTS), np.dtype(np.int64))
         self.links = room((EMPTY_ROWS, 2), np.dtype(np.int32))
-        self.counts = np.zeros(3, np.int64)
-        self._jobs = jobs
+        self._jobs, self._shards = jobs, min(jobs, MOST_SHARDS)
+        self.counts = np.zeros((self._shards, 3), np.int64)
+        self._tables = [empty_hash(EMPTY_BLOCKS // self._shards) for _ in range(self._shards)]
         self._held: list[PointChunk] = []
-        self._depths: dict[tuple[float, ...], NDArray[np.float32]] = {}
+        self._beams: dict[tuple[float, ...], Ints] = {}
+        self._looking: tuple[tuple[float, ...], Ints] | None = None
+
+    @property
+    def unaddressable(self) -> int:
+        """Points too far from the rest to be in a cell."""
+        return int(self.counts[0, 2])
 
     def add(self, chunk: PointChunk) -> None:
         """Sum a chunk's points into the grid and into the depth map of its scanner."""
@@ -68,38 +79,55 @@ class MomentGrid:
         if self.offset is None:
             self._settle(chunk)
             return
-        # Each takes a core: neither touches what the other writes.
-        side_by_side(self._jobs, lambda: self._sum(chunk), lambda: self._look(chunk))
-        self.points += len(chunk)
-        self.unaddressable = int(self.counts[2])
-
-    def _sum(self, chunk: PointChunk) -> None:
-        """Add a chunk's points to the moments of their cells."""
         from scanfind.kernels.grid import accumulate
 
         has_origin = chunk.origin is not None
         self.signed &= has_origin
         origin = np.zeros(3) if chunk.origin is None else np.asarray(chunk.origin, np.float64)
-        at = 0
-        while True:
-            at = accumulate(
-                chunk.xyz, at, origin, has_origin, self.offset, self.cell, self.hash_keys, self.hash_values,
-                self.block_keys, self.block_rows, self.moments, self.links, self.counts,
+        seen = self._beams_from(origin - self.offset) if has_origin else np.empty((self._shards, 0), np.int64)
+        xyz, offset = chunk.xyz, self.offset
+        self._in_shards(
+            len(chunk),
+            lambda at, shard, arrays: accumulate(
+                xyz, at, origin, has_origin, offset, self.cell, shard, self._shards, *arrays, seen[shard], DEPTH_PIXELS
+            ),
+        )
+        self.points += len(chunk)
+
+    def _in_shards(self, count: int, work: Callable[[int, int, Arrays], int]) -> None:
+        """Call work(at, shard, the shard's arrays) until each shard is at `count`, with more room where it stopped."""
+        reached = [0] * self._shards
+
+        def run(shard: int) -> None:
+            arrays = (
+                *self._tables[shard], self.block_keys, self.block_rows, self.moments, self.links, self.counts[shard],
             )  # fmt: skip
-            if at == len(chunk):
+            reached[shard] = work(reached[shard], shard, arrays)
+
+        while True:
+            jobs = self._jobs if count >= WORTH_A_THREAD else 1
+            side_by_side(jobs, *[partial(run, shard) for shard in range(self._shards) if reached[shard] < count])
+            if min(reached) == count:
                 return
             self._make_room()
 
-    def _look(self, chunk: PointChunk) -> None:
-        """Note how far a chunk's scanner saw in each direction."""
-        from scanfind.kernels.grid import note_ranges
+    def _beams_from(self, origin: Floats) -> Ints:
+        """The nearest beam in each direction from a scanner that each shard notes, (shards, pixels)."""
+        from scanfind.kernels.grid import NO_BEAM
 
-        if chunk.origin is None or self.offset is None:
-            return
-        origin = np.asarray(chunk.origin, np.float64)
-        key = tuple((origin - self.offset).tolist())
-        ranges = self._depths.setdefault(key, np.full(6 * DEPTH_PIXELS**2, np.inf, np.float32))
-        note_ranges(chunk.xyz, origin, ranges, DEPTH_PIXELS)
+        key = tuple(origin.tolist())
+        if self._looking is None or self._looking[0] != key:
+            self._look_away()
+            self._looking = key, np.full((self._shards, 6 * DEPTH_PIXELS**2), NO_BEAM)
+        return self._looking[1]
+
+    def _look_away(self) -> None:
+        """Join what the shards noted from the scanner of the last chunk: a map for each of 50 stations is enough."""
+        if self._looking is not None:
+            key, seen = self._looking
+            nearest = seen.min(axis=0)
+            self._beams[key] = np.minimum(self._beams[key], nearest) if key in self._beams else nearest
+            self._looking = None
 
     def _settle(self, chunk: PointChunk) -> None:
         """Hold chunks back until there are enough points to say where the scan lies; then add what was held.
@@ -118,25 +146,43 @@ class MomentGrid:
             self.offset = np.round(np.median(first, axis=0))
         for chunk in held:
             self.add(chunk)
+        self._look_away()
 
     def _make_room(self) -> None:
-        """Double whichever array is full; copied is only what is in use."""
+        """Double whichever array some shard has filled."""
         from scanfind.kernels.blocks import fill_hash
-        from scanfind.kernels.grid import ROWS_OF_OCTANT
+        from scanfind.kernels.grid import BLOCKS_A_LOT, ROWS_A_LOT, ROWS_OF_OCTANT, room_for
 
-        if self.counts[0] + 1 > len(self.block_keys):
-            self.block_keys = doubled(self.block_keys)
+        blocks, rows, _ = self.counts.max(axis=0)
+        if blocks + 1 > room_for(len(self.block_keys), BLOCKS_A_LOT, self._shards):
             self.block_rows = doubled(self.block_rows)
-            self.hash_keys = np.full(4 * len(self.block_keys), -1, np.int64)
-            self.hash_values = np.zeros(len(self.hash_keys), np.int32)
-            fill_hash(self.block_keys[: self.counts[0]], self.hash_keys, self.hash_values)
-        if self.counts[1] + ROWS_OF_OCTANT > len(self.moments):
+            self.block_keys = np.concatenate([self.block_keys, np.full(len(self.block_keys), -1)])
+            used = np.flatnonzero(self.block_keys >= 0)
+            for shard in range(self._shards):
+                self._tables[shard] = empty_hash(len(self.block_keys) // self._shards)
+                theirs = used[used // BLOCKS_A_LOT % self._shards == shard]
+                fill_hash(self.block_keys, theirs, *self._tables[shard])
+        if rows + ROWS_OF_OCTANT > room_for(len(self.moments), ROWS_A_LOT, self._shards):
             self.moments, self.links = doubled(self.moments), doubled(self.links)
+
+    def blocks(self) -> NDArray[np.intp]:
+        """Where the blocks in use lie, in the order of their keys."""
+        self.release()
+        used = np.flatnonzero(self.block_keys >= 0)
+        return np.asarray(used[np.argsort(self.block_keys[used])])
+
+    def rows_end(self) -> int:
+        """All rows in use lie before this one."""
+        from scanfind.kernels.grid import ROWS_A_LOT
+
+        self.release()
+        lots = -(-int(self.counts[:, 1].max()) // ROWS_A_LOT)
+        return lots * self._shards * ROWS_A_LOT
 
     def points_per_row(self) -> float:
         """Raw points a cell, on average, counting a cell once for each view."""
         self.release()
-        return self.points / max(int(self.counts[1]), 1)
+        return self.points / max(int(self.counts[:, 1].sum()), 1)
 
     def coarser(self) -> MomentGrid:
         """The next level of the octree: cells of twice the edge, each the sum of its eight children."""
@@ -144,35 +190,40 @@ class MomentGrid:
 
         self.release()
         parent = MomentGrid(2.0 * self.cell, self.offset, self._jobs)
-        parent.points, parent.unaddressable, parent.signed = self.points, self.unaddressable, self.signed
+        parent.points, parent.signed = self.points, self.signed
+        parent.counts[0, 2] = self.counts[0, 2]
         parent.units = 2.0 * self.units
-        parent._depths = self._depths
-        blocks = int(self.counts[0])
-        at = 0
-        while True:
-            at = sum_children(
-                at, self.block_keys[:blocks], self.block_rows, self.moments, self.links, np.int64(self.units / 2),
-                parent.hash_keys, parent.hash_values, parent.block_keys, parent.block_rows, parent.moments,
-                parent.links, parent.counts,
-            )  # fmt: skip
-            if at == blocks:
-                return parent
-            parent._make_room()
-
-    def depth_maps(self) -> list[DepthMap]:
-        """One for each scanner position, in the order of their coordinates."""
-        self.release()
-        return joined_until_spoken(
-            [DepthMap(np.array(key), self._depths[key], DEPTH_PIXELS) for key in sorted(self._depths)]
+        parent._beams = self._beams
+        blocks, half = self.blocks(), np.int64(self.units / 2)
+        keys, cells = self.block_keys, self.block_rows
+        parent._in_shards(
+            len(blocks),
+            lambda at, shard, arrays: sum_children(
+                at, blocks, keys, cells, self.moments, self.links, half, shard, self._shards, *arrays
+            ),
         )
+        return parent
+
+    def beams(self) -> list[Beams]:
+        """The nearest in each direction from each scanner position, in the order of their coordinates."""
+        self.release()
+        return [Beams(np.array(key), self._beams[key], DEPTH_PIXELS) for key in sorted(self._beams)]
 
 
 def room(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """An array of zeros that costs memory only where it is written.
+    """An array of zeros that costs memory only where it is written, from its beginning on.
 
-    NumPy asks for huge pages, of which one written byte takes 2 MB: on a virtual machine that was a second of a pass.
+    In huge pages where the system has them: they took a tenth of a second off a pass of 10 M points. NumPy asks for
+    them as well, but clears what it is asked to clear.
     """
-    return np.frombuffer(mmap(-1, int(np.prod(shape)) * dtype.itemsize), dtype).reshape(shape)
+    size = int(np.prod(shape)) * dtype.itemsize
+    if not hasattr(mmap, "MAP_PRIVATE"):
+        return np.frombuffer(mmap.mmap(-1, size), dtype).reshape(shape)
+    pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    if hasattr(mmap, "MADV_HUGEPAGE"):
+        with suppress(OSError):
+            pages.madvise(mmap.MADV_HUGEPAGE)
+    return np.frombuffer(pages, dtype).reshape(shape)
 
 
 def doubled(array: NDArray[Any]) -> NDArray[Any]:
@@ -180,3 +231,9 @@ def doubled(array: NDArray[Any]) -> NDArray[Any]:
     larger = room((2 * len(array), *array.shape[1:]), array.dtype)
     larger[: len(array)] = array
     return larger
+
+
+def empty_hash(entries: int) -> tuple[Ints, NDArray[np.int32]]:
+    """Keys and values of an empty hash table with room for so many entries at a load of at most a half."""
+    size = 1 << max(4, int(2 * max(entries, 1) - 1).bit_length())
+    return np.full(size, -1, np.int64), np.zeros(size, np.int32)

@@ -56,7 +56,7 @@ PRESETS = {
             overlap_ratio=0.15, time_limit_s=20.0, miss_probability=0.0, max_instances=1, facing_only=False,
             by_shape=False, telling_first=False, normal_length_m=1.0,
         ),
-        refine=RefineParameters(coarse_iterations=3, fine_iterations=2),
+        refine=RefineParameters(coarse_iterations=3, fine_iterations=2, raw_steps=0),
         verify=VerifyParameters(
             min_score=0.0, min_support=0.15, min_support_blind=0.15, penalty_weight=0.0, alternatives=0
         ),

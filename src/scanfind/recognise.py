@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 
 from scanfind.assembly import Assemblies, Explained, View
 from scanfind.detection import Detection, Motion, Refused
+from scanfind.free_space import Limits, caster_of, spoken_of
 from scanfind.pose import Pose
-from scanfind.refine import Refined, icp, shrinking, unobservable
+from scanfind.refine import Refined, covariance_of, icp, shrinking, triple, unobservable
 from scanfind.search import AREA_OF_A_SAMPLE, Hypotheses, Search, model_arrays
-from scanfind.symmetry import self_similar
 from scanfind.verify import (
     Evidence,
     Level,
     distances,
     distinct,
-    gather,
+    gather_rough,
+    gather_support,
     outlines,
     rough_score,
     score,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from scanfind.library import JointTable
     from scanfind.model import Model
     from scanfind.parameters import Parameters
+    from scanfind.rays import RayCaster
     from scanfind.scene import Scene
     from scanfind.surfels import Surfels
 
@@ -47,6 +49,10 @@ ALL_SAMPLES = 1 << 30
 # Share of the score asked for that the evidence on the coarse surfels must reach: there 400 samples tell the final
 # score of a shop's 96 best poses within 0.2.
 PROMISING = 0.67
+# A score that none of the poses a model could be taken for reaches: of 218 wrong poses in shops one was above 0.96, of
+# 128 right ones in shops sparse or with half of the object gone 60.
+SURE = 0.98
+NET_PENALTY = 2.0
 WEARY = 12  # poses of a model tried in parts, from which on only what comes closer than any of these is tried
 REFUSED_SHOWN = 3  # of each model: what came closest
 
@@ -56,7 +62,7 @@ class Candidate(NamedTuple):
 
     model : its number among those sought
     rotation, translation : (3, 3), (3,) scene_from_model, relative to the grid's offset
-    hessian : (6, 6) of ICP, see Refined
+    hessian, rms : (6, 6) of ICP and what it left, metres, see Refined
     score : 0 … 1; area : supported surface, counted by how much it tells, less what was seen through, m²: by it
         conflicting poses are ranked
     whole : its parts, where they were fitted: of a pose that is believed by them alone
@@ -66,6 +72,7 @@ class Candidate(NamedTuple):
     rotation: Floats
     translation: Floats
     hessian: Floats
+    rms: float
     evidence: Evidence
     score: float
     area: float
@@ -96,7 +103,7 @@ class Recognition:
         # Poses closer than a thirtieth of the diameter meet in one ICP; after it a hundredth tells them apart.
         self._apart_before, self._apart_after = diameters / 30.0, diameters / 100.0
         self._drawn_in = diameters / 10.0
-        self._similar: dict[int, list[Pose]] = {}
+        self._casters: dict[int, RayCaster] = {}
         view = View(scene, self._fine, self._thin, self.signed, parameters.verify)
         self._assemblies = Assemblies(models, view, parameters.assembly, self.blind)
         self._tried_in_parts: list[Candidate] = []
@@ -140,8 +147,9 @@ class Recognition:
 
     def _promising(self, hypotheses: Hypotheses, shown: int) -> NDArray[np.intp]:
         """Those whose evidence on the coarse surfels is not hopeless, and the best `shown` of each model (indices)."""
-        verify, evidence = self.parameters.verify, self._evidence(hypotheses, self._rough)
-        scores = np.array([rough_score(seen, self.blind, verify) for seen in evidence])
+        verify = self.parameters.verify
+        rough = gather_rough(hypotheses, self.scene, self._rough, self.arrays, self.signed, verify, self.jobs)
+        scores = np.array([rough_score(seen, self.blind) for seen in rough])
         kept = scores >= PROMISING * verify.min_score
         for model in np.unique(hypotheses.models):
             theirs = np.flatnonzero(hypotheses.models == model)
@@ -174,36 +182,53 @@ class Recognition:
 
     def _fit_near(self, hypotheses: Hypotheses, reach: int) -> None:
         """Fit the fine surfels up to `reach` cells from the placed samples of some poses."""
-        near = self._no_rows()
+        placed, starts = [np.empty((0, 3))], self.arrays.starts
         for number, rotation, translation in zip(*hypotheses[:3], strict=True):
-            samples = self.arrays.points[self.arrays.starts[number] : self.arrays.starts[number + 1]]
-            self._mark(samples @ rotation.T + translation, reach, near)
+            samples = self.arrays.points[starts[number] : starts[number + 1]]
+            placed.append(samples @ rotation.T + translation)
+        near = self._no_rows()
+        self._mark(np.concatenate(placed), reach, near)
         self.scene.fine.fit(near[self.scene.fine.cells.rows])
 
     def _no_rows(self) -> NDArray[np.bool_]:
         return np.zeros(len(self.scene.fine.sides), np.bool_)
 
-    def _evidence(self, hypotheses: Hypotheses, level: Level, thin: Level | None = None) -> list[Evidence]:
-        verify = self.parameters.verify
-        return gather(hypotheses, self.scene, level, thin, self.arrays, self.signed, verify, self.jobs)
-
     def candidates(self, refined: Refined) -> list[Candidate]:
         """Refined poses with their evidence."""
-        verify = self.parameters.verify
-        self._fit_near(refined.hypotheses, ceil(verify.gate_cells))
-        evidence = self._evidence(refined.hypotheses, self._fine, self._thin)
+        self._fit_near(refined.hypotheses, ceil(self.parameters.verify.gate_cells))
         found = []
-        for k, seen in enumerate(evidence):
+        for k, seen in enumerate(self._evidence(refined.hypotheses)):
             number = int(refined.hypotheses.models[k])
-            model = self.models[number]
-            net = seen.telling - verify.penalty_weight * seen.penalty()
+            # What a pose explains of the scene, in samples; what beams passed through counts double.
+            net = (seen.telling - NET_PENALTY * seen.penalty()) * seen.samples
             found.append(
                 Candidate(
                     number, refined.hypotheses.rotations[k], refined.hypotheses.translations[k], refined.hessians[k],
-                    seen, score(seen, self.blind, verify), net * seen.samples * AREA_OF_A_SAMPLE * model.spacing**2,
+                    float(refined.rms[k]), seen, score(seen, self.blind, self.parameters.verify),
+                    net * AREA_OF_A_SAMPLE * self.models[number].spacing ** 2,
                 )
             )  # fmt: skip
         return found
+
+    def _evidence(self, hypotheses: Hypotheses) -> list[Evidence]:
+        """What surfels and beams say of poses near which the fine surfels are fitted."""
+        verify, level = self.parameters.verify, self._fine
+        limits = Limits(level.inlier, level.margin(verify), verify.least_facing)
+        support = gather_support(
+            hypotheses, self.scene, level, self._thin, self.arrays, self.signed, verify, self.jobs
+        )  # fmt: skip
+        found = []
+        for seen, number, rotation, translation in zip(support, *hypotheses[:3], strict=True):
+            model, placed = self.models[number], Pose(rotation, translation)
+            spoken = spoken_of(model, self._caster(number), placed, self.scene.beams, limits)
+            found.append(Evidence(*seen[:-1], spoken, seen.claims))
+        return found
+
+    def _caster(self, number: int) -> RayCaster:
+        """The surface of a model, made ready for beams when first asked for."""
+        if number not in self._casters:
+            self._casters[number] = caster_of(self.models[number])
+        return self._casters[number]
 
     def believe(self, hypotheses: Hypotheses, refined: Refined) -> None:
         """Accept what the evidence carries; of poses that claim one surface, the one that explains most of it.
@@ -251,7 +276,9 @@ class Recognition:
         weary = {model: sum(c.model == model for c in self._tried_in_parts) >= WEARY for model in tried}
         for candidate in sorted(refused, key=lambda c: -c.score):
             model = candidate.model
-            if candidate.score < limits.least_score or tried[model] >= limits.tried or self._shares(candidate, claimed):
+            if candidate.evidence.visible_support() < limits.least_visible or tried[model] >= limits.tried:
+                continue
+            if self._shares(candidate, claimed):
                 continue
             if weary[model] and candidate.score <= best[model]:
                 continue
@@ -262,7 +289,7 @@ class Recognition:
             whole = self._assemblies.explain(model, Pose(candidate.rotation, candidate.translation))
             if whole is None or whole.reason:
                 continue
-            net = whole.evidence.telling - self.parameters.verify.penalty_weight * whole.evidence.penalty()
+            net = whole.evidence.telling - NET_PENALTY * whole.evidence.penalty()
             area = net * len(self.models[model].samples) * AREA_OF_A_SAMPLE * self.models[model].spacing ** 2
             found.append(
                 candidate._replace(
@@ -299,15 +326,18 @@ class Recognition:
 
     def _mark(self, points: Floats, reach: int, marked: NDArray[np.bool_]) -> None:
         """Mark the rows of the fine cells up to `reach` cells from points (N, 3)."""
-        from scanfind.kernels.nearest import mark_around
+        from scanfind.kernels.nearest import mark_around, mark_rows
 
         at = self.scene.fine.cells
-        mark_around(points, reach, at.cell, at.hash_keys, at.hash_values, at.block_rows, marked)
+        layers = np.zeros((len(at.block_rows), 8), np.uint64)
+        mark_around(points, reach, at.cell, at.hash_keys, at.hash_values, layers)
+        mark_rows(at.order, layers, at.block_rows, marked)
 
     def _hits(self, hypotheses: Hypotheses, found: Candidate) -> int:
-        """How many of a round's hypotheses lead to a pose, or to one it is turned onto by the model's symmetry."""
-        placed = Pose(found.rotation, found.translation)
-        poses = [placed, *(placed @ motion for motion in self._similar.get(found.model, []))]
+        """How many of a round's hypotheses lead to a pose, or to one that looks the same or could be taken for it."""
+        placed, model = Pose(found.rotation, found.translation), self.models[found.model]
+        motions = [*model.symmetry.motions(), *self._similar(found.model)]
+        poses = [placed @ motion for motion in motions]
         theirs = outlines(self._placements(found.model, poses), self.arrays)
         mine = outlines(hypotheses.take(np.flatnonzero(hypotheses.models == found.model)), self.arrays)
         return sum(bool((distances(one, theirs) < self._drawn_in[found.model]).any()) for one in mine)
@@ -325,15 +355,17 @@ class Recognition:
         claims = self.scene.fine.cells.rows[self.scene.fine.cell_of[candidate.evidence.claims]]
         return bool(claimed[claims].mean() > self.parameters.verify.shared) if len(claims) else True
 
+    def _similar(self, model: int) -> list[Pose]:
+        """The motions after which a model could be taken for itself. True symmetries are not tried: nothing tells."""
+        return [each.motion for each in self.models[model].similar[: self.parameters.verify.alternatives]]
+
     def _best_of_similar(self, candidate: Candidate) -> Candidate:
         """The best of a pose and those it could be taken for: the model turned over onto itself, each refined again."""
-        if not self.parameters.verify.alternatives:
+        if candidate.score >= SURE:
             return candidate
         number = candidate.model
-        if number not in self._similar:
-            self._similar[number] = self_similar(self.models[number], self.parameters.verify.alternatives)
         placed = Pose(candidate.rotation, candidate.translation)
-        others = [placed @ motion for motion in self._similar[number]]
+        others = [placed @ motion for motion in self._similar(number)]
         if not others:
             return candidate
         turned = self._placements(number, others)
@@ -356,11 +388,17 @@ class Recognition:
         if whole is not None:
             self._in_parts[number] = found.model, whole
             found = found._replace(rotation=whole.pose.rotation, translation=whole.pose.translation)
-        seen = found.evidence
+        # Of poses that look the same the one whose parts are told: turned over, each would have another's name.
+        pose = self._as_found(found) if whole else self._pose(found)
+        seen, radius = found.evidence, float(self.arrays.radii[found.model])
+        pivot = pose.move(self.arrays.centres[found.model][None])[0]
+        below = self.parameters.refine.unobservable_below
         return Detection(
-            id=number, model=self.models[found.model].name, scene_from_model=self._pose(found), score=found.score,
+            id=number, model=self.models[found.model].name, scene_from_model=pose, score=found.score,
             support=seen.support(), visible_support=seen.visible_support(), penalty=seen.penalty(),
             coverage=seen.support(), rms_m=seen.rms, unobservable=self._unobservable(found),
+            covariance=covariance_of(found.hessian, found.rms, radius, below) if np.isfinite(found.rms) else None,
+            pivot=triple(pivot),
             parts=whole.parts if whole else (),
         )  # fmt: skip
 
@@ -381,12 +419,17 @@ class Recognition:
         return replace(found, scene_from_model=pose, parts=whole.parts)
 
     def _pose(self, found: Candidate) -> Pose:
+        """In the scans' own frame; of the poses that look the same always one, however it was come by."""
+        return self.models[found.model].symmetry.canonical(self._as_found(found))
+
+    def _as_found(self, found: Candidate) -> Pose:
+        """In the scans' own frame."""
         return Pose(found.rotation, found.translation + self.scene.fine.cells.offset)
 
     def _unobservable(self, found: Candidate) -> tuple[Motion, ...]:
         """In the model's own axes."""
         turn = np.zeros((6, 6))
-        turn[:3, :3] = turn[3:, 3:] = found.rotation
+        turn[:3, :3] = turn[3:, 3:] = self._pose(found).rotation
         centre, radius = self.arrays.centres[found.model], float(self.arrays.radii[found.model])
         return unobservable(turn.T @ found.hessian @ turn, centre, radius, self.parameters.refine.unobservable_below)
 

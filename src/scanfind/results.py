@@ -10,6 +10,7 @@ import time
 import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -232,8 +233,8 @@ def _write_points(path: Path, instance: int, points: IsolatedPoints, findings: F
 
 CSV_COLUMNS = (
     "id", "model", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "score", "support", "visible_support", "penalty",
-    "coverage", "rms_m", "points", "deviation_mean_m", "deviation_rms_m", "deviation_p95_m", "deviation_worst_m",
-    "unobservable", "isolated",
+    "coverage", "rms_m", "sigma_m", "sigma_deg", "points", "deviation_mean_m", "deviation_rms_m", "deviation_p95_m",
+    "deviation_worst_m", "unobservable", "isolated",
 )  # fmt: skip
 
 
@@ -244,9 +245,18 @@ def _write_csv(path: Path, results: schema.Results) -> None:
         out.writerow(CSV_COLUMNS)
         for found in results.detections:
             q, deviation = found.quaternion, found.deviation
+            sigma_deg = None if found.sigma_rad is None else degrees(found.sigma_rad)
             out.writerow(
                 [found.id, found.model, *found.translation_m, q.x, q.y, q.z, q.w, found.score, found.support]
-                + [found.visible_support, found.penalty, found.coverage, found.rms_m, found.points]
+                + [
+                    found.visible_support,
+                    found.penalty,
+                    found.coverage,
+                    found.rms_m,
+                    found.sigma_m,
+                    sigma_deg,
+                    found.points,
+                ]
                 + ([""] * 4 if deviation is None else list(deviation.model_dump().values()))
                 + [" ".join(motion.kind for motion in found.unobservable), found.isolated or ""]
             )

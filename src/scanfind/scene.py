@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.depth import DepthMap
+from scanfind.depth import Beams, DepthMap, joined_until_spoken
 from scanfind.errors import require
-from scanfind.moments import MomentGrid
-from scanfind.surfels import Surfels, empty_hash
+from scanfind.moments import MomentGrid, empty_hash
+from scanfind.surfels import Surfels
 
 Floats = NDArray[np.float64]
 
@@ -74,7 +74,8 @@ class Scene:
     fine : cells for drawing, verification and ICP, fitted where they are asked for
     coarse : cells of twice the edge, for ICP's first steps; around : of four times, for the shape around a cell
     tolerant : cells for the sequential test, at least four times as large as the fine ones
-    depths : what each known scanner position saw; empty where none is known
+    beams : what each known scanner position saw; empty where none is known
+    depths : the same as ranges, in pixels joined until they are mostly filled: quick to ask, and at edges wrong
     noise : spread of raw points across the median surfel: the scanner's noise, metres (see `noise_of`)
     points, unaddressable : raw points in the grid, and those too far from the rest to be
     """
@@ -83,6 +84,7 @@ class Scene:
     coarse: Surfels
     around: Surfels
     tolerant: OrientationGrid
+    beams: list[Beams]
     depths: list[DepthMap]
     noise: float
     points: int
@@ -126,9 +128,11 @@ def build_scene(
     around = Surfels(quarter, 1, jobs).fit()
     test_cell = max(diameter / test_cells_across, around.cell)
     tolerant = orientation_grid(coarse, 0.5 * test_cell, test_cell)
+    beams = grid.beams()
+    depths = joined_until_spoken([of.ranges() for of in beams])
     return Scene(
-        fine, coarse, around, tolerant, grid.depth_maps(), noise_of(fine, some(fine)), grid.points, grid.unaddressable
-    )  # fmt: skip
+        fine, coarse, around, tolerant, beams, depths, noise_of(fine, some(fine)), grid.points, grid.unaddressable
+    )
 
 
 def some(surfels: Surfels) -> NDArray[np.intp]:
@@ -193,4 +197,4 @@ def orientation_grid(surfels: Surfels, reach: float, cell: float) -> Orientation
         block_keys = np.concatenate([block_keys, np.empty_like(block_keys)])
         masks = np.concatenate([masks, np.empty_like(masks)])
         hash_keys, hash_values = empty_hash(2 * room)
-        fill_hash(block_keys[: counts[0]], hash_keys, hash_values)
+        fill_hash(block_keys, np.arange(counts[0]), hash_keys, hash_values)

@@ -15,6 +15,8 @@ SCHEMA = 1
 Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]
+Six = tuple[float, float, float, float, float, float]
+Covariance = tuple[Six, Six, Six, Six, Six, Six]
 
 
 class Entry(BaseModel):
@@ -36,13 +38,36 @@ class ScanEntry(Entry):
     fingerprint: str | None = None
 
 
+class AxisEntry(Entry):
+    """A unit direction of the model's frame, and the order of the turns about it: n for 2π/n, null for every angle."""
+
+    direction: Vector
+    order: int | None
+
+
+class SymmetryEntry(Entry):
+    """The rotations that map a model onto itself: those about these axes through `centre_m`, in any succession.
+
+    No axis: none. Two of order null: every rotation, as of a sphere. Of poses that look the same the one reported is
+    nearest to the model standing as it was drawn. `words` says it for people.
+    """
+
+    words: str
+    centre_m: Vector
+    axes: list[AxisEntry]
+
+
 class ModelEntry(Entry):
-    """A model that was sought. `sha256`: of its geometry and of the parameters it was prepared with."""
+    """A model that was sought. `sha256`: of its geometry and of the parameters it was prepared with.
+
+    `symmetry` is null in results of scanfind before it knew of it.
+    """
 
     name: str
     sha256: str
     diameter_m: float
     pairs: int
+    symmetry: SymmetryEntry | None = None
 
 
 class Quaternion(Entry):
@@ -55,11 +80,16 @@ class Quaternion(Entry):
 
 
 class MotionEntry(Entry):
-    """A motion the data do not fix, model frame: `kind` is slide or roll."""
+    """A motion the data do not fix, or hardly, model frame: `kind` is slide or roll.
+
+    `sigma` is how uncertain the pose is along it, where the data say so little that it is more than the noise of a
+    single point: metres for a slide, radians for a roll. null: the data say nothing, the pose may be anywhere along it.
+    """
 
     kind: str
     axis: Vector
     through_m: Vector
+    sigma: float | None = None
 
 
 class DeviationEntry(Entry):
@@ -99,6 +129,13 @@ class PartEntry(Entry):
 class DetectionEntry(Entry):
     """One instance of one model. `isolated` and `pose` are files of the result folder, null where none was written.
 
+    `covariance` is of the error of `scene_from_model`, rows and columns (rx, ry, rz, x, y, z) in the axes of the scan
+    file, radians and metres: the true pose is the found one turned by the rotation vector (rx, ry, rz) about `pivot_m`,
+    a point of the scan file's frame, then shifted by (x, y, z). No number is infinite: along those of `unobservable`
+    whose sigma is null it is zero, and means nothing; it has a pseudo-inverse then, no inverse. It knows what points
+    disagree by, not what they are all off by, such as a registration. `sigma_m` and `sigma_rad` say it in short: by how
+    much the pivot and the rotation are off, root mean square. All four are null in results of an earlier version.
+
     `parts` is empty where they were not asked for (`assembly.parts`, --parts) and where the model has but one. With
     parts, `isolated` and `deviation` are of the parts where they were built.
     """
@@ -119,6 +156,10 @@ class DetectionEntry(Entry):
     isolated: str | None
     pose: str | None
     deviation: DeviationEntry | None
+    covariance: Covariance | None = None
+    pivot_m: Vector | None = None
+    sigma_m: float | None = None
+    sigma_rad: float | None = None
     parts: list[PartEntry] = []
 
 

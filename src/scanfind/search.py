@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.errors import require
+from scanfind.moments import empty_hash
 from scanfind.pairs import rung_distance, rungs_of
 from scanfind.scene import flatness_above
-from scanfind.surfels import empty_hash
 from scanfind.threads import in_threads
 
 if TYPE_CHECKING:
@@ -29,8 +29,10 @@ AREA_OF_A_SAMPLE = 1.4
 LEARNT = 0.5
 # Cells drawn from: fewer make pairs that repeat each other, more cost more to fit than they add to a round's pairs.
 LEAST_POOL, MOST_POOL = 20_000, 100_000
-# Rounds after the first: a little more than is missing, and enough to be worth refining.
-ROUND_MARGIN, LEAST_ROUND = 1.1, 0.2
+ROUNDS_A_POOL = 4  # draw from mostly the same cells, which are fitted then; small parts need others in the long run
+# The first round tells how easily an instance is found, and often finds all there is. Rounds after it: a little more than
+# is missing, and enough to be worth refining.
+FIRST_ROUND, ROUND_MARGIN, LEAST_ROUND = 0.3, 1.1, 0.15
 # With so many scanner positions nearly every sample faces one, and asking costs more than it tells.
 FACING_ORIGINS = 6
 PARTNERS_COUNTED = 40  # surfels whose partners are counted, each against all of the pool
@@ -40,9 +42,9 @@ BINS_A_DISTANCE = 6
 # windows over 0.1 m, a pipe as wide as the window above the last.
 BEND_BORDERS = (0.02, 0.05, 0.1)
 # A pair that lies on an instance finds it when noise left its feature in the right cell of the hash table and one of
-# the model's pairs there is near enough: measured 0.5 on spools, 0.05 – 0.4 on frames. Only until an instance is
-# found; then it is counted (Search.learn).
-RIGHT_PAIR_FINDS = 0.05
+# the model's pairs there is near enough: measured 0.5 on spools, 0.05 – 0.4 on frames, and on sparse ones far less. Only
+# until an instance is found; then it is counted (Search.learn).
+RIGHT_PAIR_FINDS = 0.012
 # A surfel's normal counts as clean below so much of a cell, noise apart; but never fewer than this share of a shape's.
 # Drawing only those doubled the right poses a round finds, on spools and frames.
 CLEAN_CELLS, CLEAN_SHARE = 0.1, 0.3
@@ -190,7 +192,7 @@ class Search:
         self.model_shapes = np.array([model_shape(model, window) for model in models])
         # As far as two samples of a model may be off, but never less than the scene's own resampling.
         self._tolerance = max(scene.fine.cell, self.pairs.tolerance * min(model.spacing for model in models))
-        self.rounds, self.effort = 0, 0.0
+        self.rounds, self.effort, self._last_share = 0, 0.0, 1.0
         self.pool = np.empty(0, np.intp)
         self._fill_pool()
         self._expected = np.zeros(len(models))
@@ -214,7 +216,7 @@ class Search:
         while 0 < np.minimum(kept, 1.0) @ counts < min(LEAST_POOL, 0.9 * counts.sum()):
             kept = kept * 1.25
         self._kept = np.minimum(kept, 1.0)
-        luck = np.random.default_rng([self.seed, self.rounds]).random(len(self._classes), np.float32)
+        luck = np.random.default_rng([self.seed, self.rounds // ROUNDS_A_POOL]).random(len(self._classes), np.float32)
         chance = self._kept.astype(np.float32)[self._classes]
         fine = self.scene.fine
         surfels = fine.of(np.flatnonzero(self._free & (luck < chance)))
@@ -275,16 +277,20 @@ class Search:
         return exp(-float(expected.min()))
 
     def _share(self) -> float:
-        """The share of a full round that the next one needs be: the first is full, the others as much as is missing."""
+        """The share of a full round that the next one needs be: as much as is missing."""
         allowed, missed = self.parameters.miss_probability, self.chance_missed()
-        if self.effort == 0.0 or allowed == 0.0 or missed == 1.0:
+        if allowed == 0.0:
+            return 1.0
+        if self.effort == 0.0:
+            return FIRST_ROUND
+        if missed == 1.0:
             return 1.0
         needed = self.effort * (log(allowed) / log(missed) - 1.0)
         return min(1.0, max(LEAST_ROUND, ROUND_MARGIN * needed))
 
     def learn(self, model: int, hits: int, support: float) -> None:
-        """Learn from an instance how often a round hits one: pairs on it go with the square of what it shows."""
-        self._learned[model] += hits, (support / self.parameters.overlap_ratio) ** 2
+        """Learn from an instance how often the last round hit it: pairs on it go with the square of what it shows."""
+        self._learned[model] += hits, self._last_share * (support / self.parameters.overlap_ratio) ** 2
 
     def _rate(self) -> Floats:
         """Hits a full round of an instance of each model that shows λs of its surface, from those found, (models,)."""
@@ -298,7 +304,7 @@ class Search:
             self._fill_pool()
         if len(self.pool) < 2:
             return Hypotheses(np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0))
-        share = self._share()
+        share = self._last_share = self._share()
         first, second, signs, keys = self._telling_pairs(share)
         count = len(first)
         support, models = np.zeros(count), np.zeros(count, np.int64)
@@ -441,7 +447,7 @@ def bin_pool(pool: NDArray[np.intp], means: Floats, distance: float, tolerance: 
     bins, starts = np.unique(keys[order], return_index=True)
     starts = np.append(starts, len(pool))
     hash_keys, hash_values = empty_hash(len(bins))
-    fill_hash(bins, hash_keys, hash_values)
+    fill_hash(bins, np.arange(len(bins)), hash_keys, hash_values)
     return Bins(
         pool[order], points[order], np.repeat(np.arange(len(bins)), np.diff(starts)), bins, hash_keys, hash_values,
         starts, shell_of(distance / edge, tolerance / edge), -1.0,

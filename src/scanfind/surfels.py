@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.moments import MomentGrid
+from scanfind.moments import MomentGrid, empty_hash
 from scanfind.threads import in_threads
 
 Floats = NDArray[np.float64]
@@ -25,8 +25,8 @@ class Cells(NamedTuple):
     cell : edge, metres
     offset : (3,) the grid's origin in the scan's frame; everything else is relative to it
     hash_keys, hash_values : packed block coordinates → block
-    block_keys : (B,); block_rows : (B, 512) int32, the row of each cell, -1 for an empty one
-    order : (B,) the blocks by key; first_cell : (B+1,) where the cells of each begin
+    block_keys : packed; block_rows : (…, 512) int32, the row of each cell, -1 for an empty one
+    order : (B,) where the blocks lie in these, by key; first_cell : (B+1,) where the cells of each begin
     locals : (V,) int16, each cell's place in its block; rows : (V,) int32, its row
     """
 
@@ -56,11 +56,10 @@ class Surfels:
 
     def __init__(self, grid: MomentGrid, min_neighbours: int = 5, jobs: int = 1) -> None:
         """No surfel fitted yet. min_neighbours : see GridParameters; jobs : threads, on which nothing depends."""
-        grid.release()
         self.cells = number(grid, jobs)
         self.signed = grid.signed
         self._grid, self._min_neighbours, self._jobs = grid, min_neighbours, jobs
-        rows = int(grid.counts[1])
+        rows = grid.rows_end()
         self.first_surfel, self.sides = np.zeros(rows, np.int32), np.zeros(rows, np.uint8)
         self.cell_of = np.empty(0, np.int32)
         self._faces = np.empty((0, 8))
@@ -138,24 +137,20 @@ class Surfels:
 
 def number(grid: MomentGrid, jobs: int) -> Cells:
     """Number a grid's cells."""
+    from scanfind.kernels.blocks import fill_hash
     from scanfind.kernels.surfels import count_cells, number_cells
 
-    used = int(grid.counts[0])
-    block_keys, block_rows = grid.block_keys[:used], grid.block_rows[:used]
-    order, counts = np.argsort(block_keys), np.empty(used, np.int64)
-    in_threads(jobs, used, lambda start, stop: count_cells(start, stop, order, block_rows, counts))
+    block_keys, block_rows, order = grid.block_keys, grid.block_rows, grid.blocks()
+    hash_keys, hash_values = empty_hash(len(order))
+    fill_hash(block_keys, order, hash_keys, hash_values)
+    counts = np.empty(len(order), np.int64)
+    in_threads(jobs, len(order), lambda start, stop: count_cells(start, stop, order, block_rows, counts))
     first_cell = np.concatenate([[0], np.cumsum(counts)])
     places, rows = np.empty(first_cell[-1], np.int16), np.empty(first_cell[-1], np.int32)
     in_threads(
-        jobs, used, lambda start, stop: number_cells(start, stop, order, block_rows, first_cell, places, rows)
+        jobs, len(order), lambda start, stop: number_cells(start, stop, order, block_rows, first_cell, places, rows)
     )  # fmt: skip
     offset = np.zeros(3) if grid.offset is None else grid.offset
     return Cells(
-        grid.cell, offset, grid.hash_keys, grid.hash_values, block_keys, block_rows, order, first_cell, places, rows
+        grid.cell, offset, hash_keys, hash_values, block_keys, block_rows, order, first_cell, places, rows
     )  # fmt: skip
-
-
-def empty_hash(entries: int) -> tuple[Ints, NDArray[np.int32]]:
-    """Keys and values of an empty hash table with room for so many entries at a load of at most a half."""
-    size = 1 << max(4, int(2 * max(entries, 1) - 1).bit_length())
-    return np.full(size, -1, np.int64), np.zeros(size, np.int32)

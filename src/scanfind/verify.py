@@ -1,11 +1,12 @@
 """Verification: what the whole scene says of a refined pose, and which of several poses may claim a surface.
 
-Support is the paper's λs = ms/m (3.4); penalty is Papazov & Burschka's (2010): samples a beam has passed through. A
-sample hidden behind something is no evidence at all.
+Support is the paper's λs = ms/m (3.4); penalty is Papazov & Burschka's (2010): surface a beam has passed through (see
+free_space). Surface hidden behind something is no evidence at all.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,6 +17,8 @@ from scanfind.errors import require
 from scanfind.threads import in_threads
 
 if TYPE_CHECKING:
+    from scanfind.depth import DepthMap
+    from scanfind.free_space import Spoken
     from scanfind.scene import Scene
     from scanfind.search import Hypotheses, ModelArrays
     from scanfind.surfels import Surfels
@@ -36,7 +39,9 @@ class VerifyParameters:
     normal_agreement : least cosine between a sample's and its surfel's normal
     margin_inliers, margin_cells : a beam passed through a sample if it went on so far behind it
     least_facing : cosine to the beam below which a surface may return nothing
-    penalty_weight : how much a sample seen through counts against one supported; 0: the paper, which looks at support
+    penalty_weight : how much surface that beams passed through counts against as much on the scan; 0: the paper, which
+        looks at support
+    beside_weight : the same for surface beside which they ended
     shared : share of its support a detection may have in common with a better one
     alternatives : how many poses a model could be mistaken for, by its own symmetry, are tried against the best
     """
@@ -51,7 +56,8 @@ class VerifyParameters:
     margin_inliers: float = 2.0
     margin_cells: float = 1.0
     least_facing: float = 0.25
-    penalty_weight: float = 2.0
+    penalty_weight: float = 6.0
+    beside_weight: float = 0.75
     shared: float = 0.2
     alternatives: int = 24
 
@@ -59,14 +65,23 @@ class VerifyParameters:
         for name in ("min_score", "min_support", "min_support_blind", "normal_agreement", "least_facing", "shared"):
             require(0.0 <= getattr(self, name) <= 1.0, name, getattr(self, name), "from 0 to 1")
         require(0.0 < self.gate_cells <= 4.0, "gate_cells", self.gate_cells, "above 0 and at most 4")
-        for name in ("inlier_noises", "inlier_cells", "margin_inliers", "margin_cells", "penalty_weight"):
+        for name in (
+            "inlier_noises",
+            "inlier_cells",
+            "margin_inliers",
+            "margin_cells",
+            "penalty_weight",
+            "beside_weight",
+        ):
             require(getattr(self, name) >= 0.0, name, getattr(self, name), "0 or more")
         require(self.alternatives >= 0, "alternatives", self.alternatives, "0 or more")
 
 
 # Share of a model's surface that scans from a few sides show: full marks where nothing tells hidden from missing.
 EXPECTED_BLIND = 0.5
-BELIEVED_SUPPORT = 0.068
+BELIEVED_SUPPORT = 0.05
+# On the coarse level a sample seen through counts so much against one supported: there many are by mistake.
+ROUGH_WEIGHT = 2.0
 # Points in a coarse cell up to which the eight fine ones in it are mostly empty.
 THIN_POINTS = 2.0
 
@@ -74,19 +89,18 @@ THIN_POINTS = 2.0
 class Evidence(NamedTuple):
     """What the scene says of the samples of one pose.
 
-    samples : N; supported, seen_through, hidden : how many of them; where few beams lead to the others, seen_through is
-        what it would be with beams enough (see spread)
+    samples : N; supported : how many of them lie on the scene
     telling : share of all samples that are supported, each counted by how much its surfel tells (Search.telling)
     rms : of the supported samples' distances to the scene, metres
+    spoken : what the beams say of the surface
     claims : surfels that support it, ascending
     """
 
     samples: int
     supported: int
-    seen_through: int
-    hidden: int
     telling: float
     rms: float
+    spoken: Spoken
     claims: NDArray[np.intp]
 
     def support(self) -> float:
@@ -94,13 +108,14 @@ class Evidence(NamedTuple):
         return self.supported / self.samples
 
     def penalty(self) -> float:
-        """Papazov & Burschka's share of samples that occlude what was seen behind them."""
-        return self.seen_through / self.samples
+        """Papazov & Burschka's share of the surface that occludes what was seen behind it, of all that beams asked."""
+        asked = sum(self.spoken)
+        return self.spoken.through / asked if asked else 0.0
 
     def visible_support(self) -> float:
-        """Share of the samples the scanners could speak of that are there."""
-        spoken = self.supported + self.seen_through
-        return self.supported / spoken if spoken else 0.0
+        """Share of the surface the scanners could see that is there."""
+        seen = self.spoken.on + self.spoken.beside + self.spoken.through
+        return self.spoken.on / seen if seen else 0.0
 
 
 def score(evidence: Evidence, blind: bool, parameters: VerifyParameters) -> float:
@@ -108,17 +123,20 @@ def score(evidence: Evidence, blind: bool, parameters: VerifyParameters) -> floa
 
     blind : no scanner position is known; then only support speaks, and half the surface is all that is expected of it
     """
-    visible = rough_score(evidence, blind, parameters)
-    # Few supported samples can agree by chance: the visible share is believed as far as their number goes.
-    return visible if blind else visible * float(1.0 - np.exp(-evidence.telling / BELIEVED_SUPPORT))
-
-
-def rough_score(evidence: Evidence, blind: bool, parameters: VerifyParameters) -> float:
-    """The score but for how much the supported surface tells."""
     if blind:
         return min(1.0, evidence.support() / EXPECTED_BLIND)
-    spoken = evidence.supported + parameters.penalty_weight * evidence.seen_through
-    return evidence.supported / spoken if spoken else 0.0
+    on, beside, through, _ = evidence.spoken
+    weighed = on + parameters.beside_weight * beside + parameters.penalty_weight * through
+    # Few supported samples can agree by chance: the visible share is believed as far as their number goes.
+    return (on / weighed if weighed else 0.0) * float(1.0 - np.exp(-evidence.telling / BELIEVED_SUPPORT))
+
+
+def rough_score(rough: Rough, blind: bool) -> float:
+    """The same from the coarse level, but for how much the supported surface tells."""
+    if blind:
+        return min(1.0, rough.supported / rough.samples / EXPECTED_BLIND)
+    spoken = rough.supported + ROUGH_WEIGHT * spread(rough.seen_through, rough.hidden, rough.silent)
+    return rough.supported / spoken if spoken else 0.0
 
 
 def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters) -> str:
@@ -130,9 +148,12 @@ def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters) -
         return ""
     if blind:
         return f"{evidence.support():.0%} of its surface lies on the scan, and no free space is known to tell more"
-    missing = 1.0 - evidence.visible_support()
-    if 1.0 - missing * parameters.penalty_weight < parameters.min_score:
-        return f"beams passed through {missing:.0%} of the surface that scanners should have seen"
+    on, beside, through, _ = evidence.spoken
+    seen = max(on + beside + through, 1e-300)
+    if on < parameters.min_score * (on + parameters.beside_weight * beside + parameters.penalty_weight * through):
+        if parameters.penalty_weight * through < parameters.beside_weight * beside:
+            return f"{beside / seen:.0%} of the surface that scanners should have seen lies beside what they saw"
+        return f"beams passed through {through / seen:.0%} of the surface that scanners should have seen"
     reached = f"score {score(evidence, blind, parameters):.4f}, {parameters.min_score} is asked for"
     return f"what lies on the scan is too little, or of a shape the scan is full of (floors, walls), to tell: {reached}"
 
@@ -149,37 +170,87 @@ class Level(NamedTuple):
     samples: int
     inlier: float
 
+    def margin(self, parameters: VerifyParameters) -> float:
+        """How far behind a surface a beam must have gone on to have passed through it, metres."""
+        return parameters.margin_inliers * self.inlier + parameters.margin_cells * self.surfels.cell
 
-def gather(
+
+class Held(NamedTuple):
+    """What a level says of each sample of some poses, end to end: see kernels.evidence.
+
+    ends : (H,) where each pose's samples end; states, residuals, claims : a sample each
+    """
+
+    ends: NDArray[np.int64]
+    states: NDArray[np.uint8]
+    residuals: NDArray[np.float32]
+    claims: NDArray[np.int32]
+
+    def poses(self) -> Iterator[slice]:
+        """The samples of each pose."""
+        return map(slice, np.concatenate([[0], self.ends[:-1]]).tolist(), self.ends.tolist())
+
+
+class Rough(NamedTuple):
+    """What a level and the depth maps say of the samples of one pose: how many are what."""
+
+    samples: int
+    supported: int
+    seen_through: int
+    hidden: int
+    silent: int
+
+
+class Supported(NamedTuple):
+    """How much of one pose lies on the scene: see Evidence."""
+
+    samples: int
+    supported: int
+    telling: float
+    rms: float
+    claims: NDArray[np.intp]
+
+
+def gather_rough(
+    hypotheses: Hypotheses, scene: Scene, level: Level, arrays: ModelArrays, signed: bool,
+    parameters: VerifyParameters, jobs: int,
+) -> list[Rough]:  # fmt: skip
+    """What a level and the depth maps say of each of H hypotheses."""
+    from scanfind.kernels.evidence import HIDDEN, SEEN_THROUGH, SILENT, SUPPORTED
+
+    held = held_against(hypotheses, scene, level, scene.depths, arrays, signed, parameters, jobs)
+    return [
+        Rough(len(state), *(int(np.count_nonzero(state == of)) for of in (SUPPORTED, SEEN_THROUGH, HIDDEN, SILENT)))
+        for state in (held.states[samples] for samples in held.poses())
+    ]
+
+
+def gather_support(
     hypotheses: Hypotheses, scene: Scene, level: Level, thin: Level | None, arrays: ModelArrays, signed: bool,
     parameters: VerifyParameters, jobs: int,
-) -> list[Evidence]:  # fmt: skip
-    """The evidence of each of H hypotheses.
+) -> list[Supported]:  # fmt: skip
+    """How much of each of H hypotheses lies on the scene.
 
     thin : a coarser level, which speaks where its cells hold so few points that the cells of `level` are mostly empty
     """
-    from scanfind.kernels.evidence import HIDDEN, SEEN_THROUGH, SILENT, SUPPORTED
+    from scanfind.kernels.evidence import SUPPORTED
 
-    sizes = np.minimum(arrays.starts[1:] - arrays.starts[:-1], level.samples)[hypotheses.models]
-    ends = np.cumsum(sizes)
-    states, residuals, claims = held_against(hypotheses, scene, level, sizes, arrays, signed, parameters, jobs)
+    held = held_against(hypotheses, scene, level, [], arrays, signed, parameters, jobs)
+    _, states, residuals, claims = held
     tells = np.where(claims >= 0, level.telling[level.surfels.cell_of[claims]], 0.0)
     if thin is not None:
-        others, apart, lent = held_against(hypotheses, scene, thin, sizes, arrays, signed, parameters, jobs)
+        _, others, apart, lent = held_against(hypotheses, scene, thin, [], arrays, signed, parameters, jobs)
         lends = (states != SUPPORTED) & (others == SUPPORTED)
         lends[lends] = thin.surfels.points[lent[lends]] <= THIN_POINTS
         states[lends], residuals[lends] = SUPPORTED, apart[lends]
         tells[lends] = thin.telling[thin.surfels.cell_of[lent[lends]]]
     found = []
-    for start, stop in zip(ends - sizes, ends, strict=True):
-        state, claim = states[start:stop], claims[start:stop]
-        on = state == SUPPORTED
-        through, hidden, silent = (int(np.count_nonzero(state == of)) for of in (SEEN_THROUGH, HIDDEN, SILENT))
-        squares = residuals[start:stop][on].astype(np.float64) ** 2
+    for samples in held.poses():
+        claim, on = claims[samples], states[samples] == SUPPORTED
+        squares = residuals[samples][on].astype(np.float64) ** 2
         found.append(
-            Evidence(
-                int(stop - start), int(np.count_nonzero(on)), spread(through, hidden, silent), hidden,
-                float(tells[start:stop].sum()) / int(stop - start),
+            Supported(
+                len(on), int(np.count_nonzero(on)), float(tells[samples].sum()) / len(on),
                 float(np.sqrt(squares.mean())) if len(squares) else float("inf"),
                 np.unique(claim[claim >= 0]).astype(np.intp),
             )
@@ -188,18 +259,20 @@ def gather(
 
 
 def held_against(
-    hypotheses: Hypotheses, scene: Scene, level: Level, sizes: NDArray[np.int64], arrays: ModelArrays, signed: bool,
+    hypotheses: Hypotheses, scene: Scene, level: Level, depths: Sequence[DepthMap], arrays: ModelArrays, signed: bool,
     parameters: VerifyParameters, jobs: int,
-) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int32]]:  # fmt: skip
-    """What a level says of each sample of each pose, `sizes` (H,) of them end to end: see kernels.evidence."""
+) -> Held:  # fmt: skip
+    """What a level, and depth maps, say of each sample of H hypotheses."""
     from scanfind.kernels.evidence import gather_evidence
 
+    sizes = np.minimum(arrays.starts[1:] - arrays.starts[:-1], level.samples)[hypotheses.models]
     ends, total = np.cumsum(sizes), int(sizes.sum())
     states, residuals, claims = np.empty(total, np.uint8), np.empty(total, np.float32), np.empty(total, np.int32)
     surfels, cells, cell = level.surfels, level.surfels.cells, level.surfels.cell
-    origins, ranges = scene.origins(), scene.ranges()
-    margin = parameters.margin_inliers * level.inlier + parameters.margin_cells * cell
-    edge = scene.depths[0].edge if scene.depths else 1
+    edge = depths[0].edge if depths else 1
+    origins = np.array([depth.origin for depth in depths]).reshape(-1, 3)
+    ranges = np.array([depth.ranges for depth in depths], np.float32).reshape(-1, 6 * edge**2)
+    margin = level.margin(parameters)
     in_threads(
         jobs, len(sizes),
         lambda start, stop: gather_evidence(
@@ -210,7 +283,7 @@ def held_against(
             parameters.least_facing, ends - sizes, states, residuals, claims,
         ),
     )  # fmt: skip
-    return states, residuals, claims
+    return Held(ends, states, residuals, claims)
 
 
 def spread(through: int, hidden: int, silent: int) -> int:

@@ -13,13 +13,26 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.assembly.fit import PartsFit, PlacedParts, View, apart, rotation_vector, skew
+from scanfind.assembly.fit import (
+    ONE_THREAD,
+    PartEvidence,
+    PartsFit,
+    PlacedParts,
+    View,
+    apart,
+    hypotheses,
+    rotation_vector,
+    skew,
+)
 from scanfind.assembly.parts import Assembly, assembly_of
 from scanfind.assembly.points import fitted_to_points, placed_faces
+from scanfind.cloud import OrientedCloud
 from scanfind.detection import PartFit
+from scanfind.free_space import Limits, caster_of, spoken_of
+from scanfind.mesh import Mesh
 from scanfind.pose import Pose, nearest_rotation, rotation_from_vector
 from scanfind.refine import motion_of, triple
-from scanfind.verify import Evidence, why_refused
+from scanfind.verify import Evidence, gather_support, why_refused
 
 if TYPE_CHECKING:
     from scanfind.assembly.parameters import AssemblyParameters
@@ -55,7 +68,7 @@ class Explained(NamedTuple):
     evidence: Evidence
     reason: str
     placed: PlacedParts
-    seen: Sequence[Evidence]
+    seen: Sequence[PartEvidence]
     parents: NDArray[np.int64]
 
 
@@ -74,7 +87,7 @@ class Assemblies:
         if model not in self._fits:
             self._fits[model] = self._cut(self._models[model])
         fit = self._fits[model]
-        return None if fit is None else explained(fit, pose, self._blind, believed=believed)
+        return None if fit is None else explained(fit, self._models[model], pose, self._blind, believed=believed)
 
     def faces(self, model: int, whole: Explained) -> Floats:
         """The faces (F, 3, 3) of a model as built, relative to the grid's offset; without its missing parts."""
@@ -100,7 +113,7 @@ class Assemblies:
         return None if assembly is None else PartsFit(assembly, self._view, self._parameters)
 
 
-def explained(fit: PartsFit, pose: Pose, blind: bool, *, believed: bool) -> Explained | None:
+def explained(fit: PartsFit, model: Model, pose: Pose, blind: bool, *, believed: bool) -> Explained | None:
     """What the scan says of a model placed near `pose`, in parts; blind : no scanner position is known."""
     fitted = fit.fit(pose, believed=believed)
     if fitted is None:
@@ -110,7 +123,7 @@ def explained(fit: PartsFit, pose: Pose, blind: bool, *, believed: bool) -> Expl
     reference, fits, kept = told(parts, seen, parents, assembly, pose)
     spared = forgiven(assembly, [part.status for part in fits], seen, parameters.most_missing)
     strained = beyond_bounds(parents, fits, fit)
-    evidence = together([one for one, spare in zip(seen, spared, strict=True) if not spare])
+    evidence = together(fit, model, parts, reference, ~spared)
     reason = why_refused(evidence, blind, verify)
     if not reason and kept < parameters.least_kept:
         reason = f"only {kept:.0%} of what is seen of it keeps to the design, {parameters.least_kept:.0%} is asked for"
@@ -139,7 +152,7 @@ def place_of(assembly: Assembly, one: int, other: int) -> Floats:
 
 
 def told(
-    parts: PlacedParts, seen: Sequence[Evidence], parents: NDArray[np.int64], assembly: Assembly, pose: Pose
+    parts: PlacedParts, seen: Sequence[PartEvidence], parents: NDArray[np.int64], assembly: Assembly, pose: Pose
 ) -> tuple[Pose, tuple[PartFit, ...], float]:  # fmt: skip
     """The pose of the design, the parts against it, and the share of the surface seen that keeps to it."""
     status = [status_of(one) for one in seen]
@@ -151,7 +164,7 @@ def told(
     return reference, fits, float(supported[keeps].sum() / max(supported.sum(), 1))
 
 
-def status_of(seen: Evidence) -> str:
+def status_of(seen: PartEvidence) -> str:
     """Whether a part is measured, missing, or not seen well enough to say."""
     least = max(LEAST_SUPPORTED, LEAST_SHOWN * seen.samples)
     if seen.supported >= least and seen.visible_support() >= THERE:
@@ -160,7 +173,7 @@ def status_of(seen: Evidence) -> str:
 
 
 def consensus(
-    parts: PlacedParts, seen: Sequence[Evidence], status: Sequence[str], assembly: Assembly, pose: Pose
+    parts: PlacedParts, seen: Sequence[PartEvidence], status: Sequence[str], assembly: Assembly, pose: Pose
 ) -> tuple[Pose, NDArray[np.bool_]]:  # fmt: skip
     """The pose of the design, scene_from_model, that the most surface keeps to, and which parts do, (P,)."""
     measured = np.array([one == MEASURED for one in status])
@@ -214,7 +227,7 @@ def agreed(parts: PlacedParts, which: NDArray[np.intp], start: Pose, assembly: A
 
 
 def told_of(
-    k: int, parts: PlacedParts, seen: Evidence, status: str, parent: int, reference: Pose, assembly: Assembly
+    k: int, parts: PlacedParts, seen: PartEvidence, status: str, parent: int, reference: Pose, assembly: Assembly
 ) -> PartFit:  # fmt: skip
     """What is reported of one part, in the model's own axes."""
     joined_to = assembly.names[parent] if parent >= 0 else None
@@ -298,7 +311,7 @@ def without(fixed: Floats, motion: Pose, centre: Floats, radius: float) -> Pose:
 
 
 def forgiven(
-    assembly: Assembly, status: Sequence[str], seen: Sequence[Evidence], most: float
+    assembly: Assembly, status: Sequence[str], seen: Sequence[PartEvidence], most: float
 ) -> NDArray[np.bool_]:  # fmt: skip
     """Which parts may be missing, (P,): those that join others at two places or more, if they are not too much."""
     joints = np.zeros(len(status), np.int64)
@@ -309,14 +322,29 @@ def forgiven(
     return spared if samples[spared].sum() <= most * samples.sum() else np.zeros(len(status), np.bool_)
 
 
-def together(seen: Sequence[Evidence]) -> Evidence:
-    """The evidence of several parts as that of one thing."""
-    samples = sum(one.samples for one in seen)
-    supported = sum(one.supported for one in seen)
+def together(
+    fit: PartsFit, model: Model, parts: PlacedParts, reference: Pose, counted: NDArray[np.bool_]
+) -> Evidence:  # fmt: skip
+    """The evidence of the parts that are counted, (P,), each where it is, as that of one thing: as of a whole pose."""
+    view, assembly = fit.view, fit.assembly
+    verify, level, chosen = view.verify, view.fine, np.flatnonzero(counted)
+    support = gather_support(
+        hypotheses(parts), view.scene, level, view.thin, assembly.arrays, view.signed, verify, ONE_THREAD
+    )  # fmt: skip
+    seen = [support[k] for k in chosen]
+    samples, supported = sum(one.samples for one in seen), sum(one.supported for one in seen)
     squares = sum(one.supported * one.rms**2 for one in seen if one.supported)
+    back = [reference.inverse() @ parts.pose(int(k)) for k in chosen]
+    points = np.concatenate([pose.move(assembly.points(k)) for pose, k in zip(back, chosen.tolist(), strict=True)])
+    normals = np.concatenate([pose.turn(assembly.normals(k)) for pose, k in zip(back, chosen.tolist(), strict=True)])
+    assert model.mesh is not None  # else it has no parts
+    faces = reference.inverse().move(placed_faces(model.mesh, assembly, parts, counted.tolist()).reshape(-1, 3))
+    mesh = Mesh.of(model.name, faces, np.arange(len(faces)).reshape(-1, 3))
+    built = replace(model, samples=OrientedCloud(points, normals, model.signed), mesh=mesh)
+    limits = Limits(level.inlier, level.margin(verify), verify.least_facing)
     return Evidence(
-        samples, supported, sum(one.seen_through for one in seen), sum(one.hidden for one in seen),
-        sum(one.telling * one.samples for one in seen) / samples,
+        samples, supported, sum(one.telling * one.samples for one in seen) / samples,
         float(np.sqrt(squares / supported)) if supported else float("inf"),
+        spoken_of(built, caster_of(built), reference, view.scene.beams, limits),
         np.unique(np.concatenate([one.claims for one in seen])),
     )  # fmt: skip

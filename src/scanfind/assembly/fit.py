@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from scanfind.pose import Pose, nearest_rotation, rotation_from_vector
 from scanfind.search import Hypotheses
-from scanfind.verify import Evidence, Level, gather, held_against
+from scanfind.verify import Level, held_against, spread
 
 if TYPE_CHECKING:
     from scanfind.assembly.parameters import AssemblyParameters
@@ -44,13 +44,15 @@ NORMALS_AGREE = 0.7  # as in the refinement of whole poses
 # A part that most of its looked-at surface supports where its neighbour has it is where it should be.
 SETTLED = 0.99
 MISLED_M = 0.003  # a part set off this far by the one it hangs on may have been misled by it
+SEEN_THROUGH_WEIGHT = 2.0  # of a sample seen through, against one that lies on the scene
+MOST_REACH = 8  # cells, see kernels.nearest.mark_around
 ONE_THREAD = 1  # a step takes a millisecond, as the start of a thread does
 
 
 class View(NamedTuple):
     """The scene as parts are held against it.
 
-    fine, thin : as whole poses are (see verify.gather); thin, which is coarser, for steps of several centimetres too
+    fine, thin : as whole poses are (see verify.gather_support); thin, which is coarser, also for wide steps
     signed : both sides know which way their normals face
     """
 
@@ -59,6 +61,29 @@ class View(NamedTuple):
     thin: Level
     signed: bool
     verify: VerifyParameters
+
+
+class PartEvidence(NamedTuple):
+    """What surfels and depth maps say of the samples of one placed part: how many there are, lie on the scene, and are
+    seen through. Beams asked one by one would tell it better, and for each of a thousand trials cost too much.
+    """
+
+    samples: int
+    supported: int
+    seen_through: int
+
+    def support(self) -> float:
+        """Share of its samples that lie on the scene."""
+        return self.supported / self.samples
+
+    def penalty(self) -> float:
+        """Share of its samples that are seen through."""
+        return self.seen_through / self.samples
+
+    def visible_support(self) -> float:
+        """Share of the samples the scanners could speak of that are there."""
+        spoken = self.supported + self.seen_through
+        return self.supported / spoken if spoken else 0.0
 
 
 class Hinges(NamedTuple):
@@ -98,10 +123,8 @@ class PartsFit:
     def __init__(self, assembly: Assembly, view: View, parameters: AssemblyParameters) -> None:
         self.assembly, self.view, self.parameters = assembly, view, parameters
         self._sizes = assembly.samples()
-        # Correspondences need no depth maps: without them the kernel asks no beams.
-        self._unseeing = replace(view.scene, depths=[])
 
-    def fit(self, pose: Pose, *, believed: bool) -> tuple[PlacedParts, list[Evidence], NDArray[np.int64]] | None:
+    def fit(self, pose: Pose, *, believed: bool) -> tuple[PlacedParts, list[PartEvidence], NDArray[np.int64]] | None:
         """The parts of a model placed at `pose` where the scan has them; what it says of each; their parents, (P,).
 
         From the part with the most evidence outwards: each begins where the one before it would have it, and where
@@ -129,21 +152,34 @@ class PartsFit:
         together = self._together(placed(np.arange(count), poses))
         return together, self.evidence(together), parents
 
-    def evidence(self, parts: PlacedParts) -> list[Evidence]:
-        """What the scene says of each placed part."""
-        at, view = hypotheses(parts), self.view
-        return gather(at, view.scene, view.fine, view.thin, self.assembly.arrays, view.signed, view.verify, ONE_THREAD)
+    def evidence(self, parts: PlacedParts) -> list[PartEvidence]:
+        """What the scene says of the samples of each placed part."""
+        from scanfind.kernels.evidence import HIDDEN, SEEN_THROUGH, SILENT, SUPPORTED
+
+        view, depths = self.view, self.view.scene.depths
+        held = held_against(
+            hypotheses(parts), view.scene, view.fine, depths, self.assembly.arrays, view.signed, view.verify, ONE_THREAD
+        )
+        found = []
+        for state in (held.states[samples] for samples in held.poses()):
+            on, through, hidden, silent = (
+                int(np.count_nonzero(state == of)) for of in (SUPPORTED, SEEN_THROUGH, HIDDEN, SILENT)
+            )
+            found.append(PartEvidence(len(state), on, spread(through, hidden, silent)))
+        return found
 
     def _reach(self, pose: Pose) -> None:
         """Fit the surfels as far around a pose as its parts may be off."""
-        from scanfind.kernels.nearest import mark_around
+        from scanfind.kernels.nearest import mark_around, mark_rows
 
         fine = self.view.scene.fine
         at, points = fine.cells, pose.move(self.assembly.arrays.points)
         near = np.zeros(len(fine.sides), np.bool_)
         # Twice: a part may be off, and what hangs on it swings out farther.
-        reach = int(np.ceil(2.0 * self.parameters.most_shift_m / at.cell)) + 1
-        mark_around(points, reach, at.cell, at.hash_keys, at.hash_values, at.block_rows, near)
+        reach = min(MOST_REACH, int(np.ceil(2.0 * self.parameters.most_shift_m / at.cell)) + 1)
+        layers = np.zeros((len(at.block_rows), 8), np.uint64)
+        mark_around(points, reach, at.cell, at.hash_keys, at.hash_values, layers)
+        mark_rows(at.order, layers, at.block_rows, near)
         fine.fit(near[at.rows])
 
     def _tree(self, root: int) -> tuple[list[int], NDArray[np.int64], Floats]:
@@ -170,10 +206,10 @@ class PartsFit:
         """Would the score be too low with at most so many samples supported and at least so many seen through?"""
         verify = self.view.verify
         spared = self.parameters.most_missing * float(self._sizes.sum())
-        against = verify.penalty_weight * max(through - spared, 0.0)
+        against = SEEN_THROUGH_WEIGHT * max(through - spared, 0.0)
         return supported < verify.min_score * (supported + against)
 
-    def _one(self, part: int, before: Pose, place: Floats) -> tuple[Pose, Evidence]:
+    def _one(self, part: int, before: Pose, place: Floats) -> tuple[Pose, PartEvidence]:
         """Where a part is that its neighbour would have at `before`, scene_from_model, joined at `place` (3,)."""
         first = self._settle(placed(np.array([part]), [before]), place, [*self._wide(), *self._narrow()])
         seen = self.evidence(first)[0]
@@ -193,15 +229,15 @@ class PartsFit:
         # Where it cannot be, within bounds, it is where its neighbour would have it.
         return (start, told) if most > -np.inf else (before, self.evidence(placed(first.numbers, [before]))[0])
 
-    def _settled(self, seen: Evidence, share: float = SETTLED) -> bool:
+    def _settled(self, seen: PartEvidence, share: float = SETTLED) -> bool:
         """Is enough of a part there, and so large a share of what could be seen of it?"""
         return seen.support() >= self.view.verify.min_support and seen.visible_support() >= share
 
-    def _net(self, seen: Evidence) -> float:
+    def _net(self, seen: PartEvidence) -> float:
         """Samples for, less those against."""
-        return seen.supported - self.view.verify.penalty_weight * seen.seen_through
+        return seen.supported - SEEN_THROUGH_WEIGHT * seen.seen_through
 
-    def _worth(self, pose: Pose, found: Evidence, before: Pose, place: Floats) -> float:
+    def _worth(self, pose: Pose, found: PartEvidence, before: Pose, place: Floats) -> float:
         """What speaks for a part being at a pose, in samples; -inf beyond the bounds."""
         if not self._near(pose, before, place):
             return -np.inf
@@ -266,10 +302,11 @@ class PartsFit:
         surfels, arrays = level.surfels, self.assembly.arrays
         sizes = np.minimum(self._sizes[parts.numbers], level.samples)
         rules = replace(self.view.verify, gate_cells=min(4.0, gate / surfels.cell), normal_agreement=NORMALS_AGREE)
-        _, _, claims = held_against(
-            hypotheses(parts), self._unseeing, level._replace(inlier=gate), sizes, arrays, self.view.signed, rules,
+        # Correspondences need no depth maps: without them the kernel asks no beams.
+        claims = held_against(
+            hypotheses(parts), self.view.scene, level._replace(inlier=gate), [], arrays, self.view.signed, rules,
             ONE_THREAD,
-        )  # fmt: skip
+        ).claims  # fmt: skip
         found = []
         for h, (number, end) in enumerate(zip(parts.numbers, np.cumsum(sizes), strict=True)):
             claim = claims[end - sizes[h] : end]

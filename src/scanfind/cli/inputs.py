@@ -27,13 +27,15 @@ def open_models(
         yield models
 
 
-def add_models(models: ModelLibrary, files: Sequence[Path], run: Run, parameters: Parameters) -> list[str]:
-    """Prepare every model of the files and keep it in the library; their names."""
+def add_models(
+    models: ModelLibrary, files: Sequence[Path], run: Run, parameters: Parameters, symmetry: str | None = None
+) -> list[str]:
+    """Prepare every model of the files and keep it in the library; their names. `symmetry`: see ModelParameters."""
     from scanfind.mesh import Mesh
     from scanfind.model import ModelParameters
     from scanfind.models import STATES_UNITS, read_models
 
-    prepared = ModelParameters(surface=parameters.surface, pairs=parameters.pairs)
+    prepared = ModelParameters(surface=parameters.surface, pairs=parameters.pairs, symmetry=symmetry)
     names = []
     for file in files:
         # One --units may stand for a mixed list of files, of which some say theirs.

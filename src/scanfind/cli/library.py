@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
 from scanfind.cli.options import Flag, Names, Units, note, say
 from scanfind.errors import LibraryError
+
+if TYPE_CHECKING:
+    from scanfind.library import ModelSummary
 
 LIBRARY_HELP = """Keep models ready for the search in one file.
 
@@ -28,6 +31,7 @@ def add(
     *,
     units: Units | None = None,
     select: Names | None = None,
+    symmetry: str | None = None,
     preset: str | None = None,
     config: Path | None = None,
 ) -> None:
@@ -36,6 +40,7 @@ def add(
     For example:
 
         scanfind library add parts.scanfind spool.stl frame.step --units mm
+        scanfind library add parts.scanfind flange.stl --symmetry "z*"
 
     Parameters
     ----------
@@ -47,6 +52,8 @@ def add(
         Of model files whose format does not say; metres unless given.
     select
         Of an IFC file only these: class, name or GlobalId.
+    symmetry
+        Of these models, instead of what is found: axes and their order, as x2, z4,x2 or z* (every angle), or none.
     preset
         Settings to start from: default or sharif2017.
     config
@@ -62,7 +69,7 @@ def add(
     run, parameters = load_settings(PRESETS, flags, config)
     with ModelLibrary.open(lib, create=True) as kept:
         before = len(kept)
-        names = add_models(kept, models, run, parameters)
+        names = add_models(kept, models, run, parameters, symmetry)
         note(f"{lib}: models read: {len(names)}, new: {len(kept) - before}, in all: {len(kept)}")
 
 
@@ -88,7 +95,7 @@ def list_models(lib: Path, /, *, json: Flag = False) -> None:
     with ModelLibrary.open(lib) as kept:
         summaries = kept.show()
     if json:
-        say(_json([summary._asdict() for summary in summaries]))
+        say(_json([_fields(summary) for summary in summaries]))
         return
     rows = [
         [s.name, f"{s.diameter:.3f}", f"{s.triangles:,}", f"{s.samples:,}", f"{s.pairs:,}", str(s.placements), s.source]
@@ -123,7 +130,9 @@ def show(lib: Path, name: str, /, *, json: Flag = False) -> None:
     if name not in summaries:
         msg = f"{lib}: no model {name!r}: {did_you_mean(name, list(summaries))}"
         raise LibraryError(msg)
-    fields = summaries[name]._asdict()
+    fields = _fields(summaries[name])
+    if not json:
+        fields["symmetry"] = summaries[name].symmetry.words()
     say(_json(fields) if json else "\n".join(f"{key:<11}{value}" for key, value in fields.items()))
 
 
@@ -147,6 +156,12 @@ def remove(lib: Path, name: str, /) -> None:
 
     with ModelLibrary.open(lib) as kept:
         kept.remove(name)
+
+
+def _fields(summary: ModelSummary) -> dict[str, object]:
+    from scanfind.document import symmetry_entry
+
+    return {**summary._asdict(), "symmetry": symmetry_entry(summary.symmetry).model_dump()}
 
 
 def _json(value: object) -> str:

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from scanfind.simulate import Sight
 
 FOUND = (
-    "id", "model", "x m", "y m", "z m", "yaw °", "pitch °", "roll °", "score", "visible %", "rms mm", "points",
-    "mean mm", "95 % mm", "free to",
+    "id", "model", "x m", "y m", "z m", "yaw °", "pitch °", "roll °", "score", "visible %", "rms mm", "± mm", "± °",
+    "points", "mean mm", "95 % mm", "free to",
 )  # fmt: skip
 
 PARTS = ("id", "part", "status", "off mm", "± mm", "x mm", "y mm", "z mm", "turned °", "± °", "joined to", "free to")
@@ -33,7 +33,10 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def found_table(results: Results) -> str:
-    """One line a detection; "mean" and "95 %" are of the signed, and of the absolute distances of its points."""
+    """One line a detection; "mean" and "95 %" are of the signed, and of the absolute distances of its points.
+
+    "±" is how far, root mean square, its middle and its rotation may be off.
+    """
     return table(FOUND, [_found_row(found) for found in results.detections])
 
 
@@ -89,6 +92,8 @@ def _found_row(found: DetectionEntry) -> list[str]:
         _number(found.score, 2),
         _number(found.visible_support, 0, 100.0),
         _number(found.rms_m, 1, 1e3),
+        _number(found.sigma_m, 2, 1e3),
+        _number(None if found.sigma_rad is None else degrees(found.sigma_rad), 3),
         f"{found.points:,}",
         _number(deviation.mean_m if deviation else None, 1, 1e3),
         _number(deviation.p95_m if deviation else None, 1, 1e3),

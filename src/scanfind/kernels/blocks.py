@@ -58,7 +58,7 @@ def insert_block(keys, values, key, value):
 
 
 @njit(cache=True, nogil=True)
-def fill_hash(block_keys, keys, values):
-    """Store value i for block_keys[i]; `keys` must come filled with EMPTY and be at least twice as long."""
-    for i in range(block_keys.shape[0]):
-        insert_block(keys, values, block_keys[i], i)
+def fill_hash(block_keys, blocks, keys, values):
+    """Store b for block_keys[b], b in blocks; `keys` must come filled with EMPTY and be at least twice as long."""
+    for block in blocks:
+        insert_block(keys, values, block_keys[block], block)

@@ -1,5 +1,8 @@
 """The streaming pass: raw points → integer moments a cell and a view direction, and the nearest range a view direction.
 
+Threads share a pass by blocks, not by points: each reads all of a chunk and adds what lies in its own blocks (its
+shard), so that none writes where another does and nothing is merged afterwards.
+
 Sums are integers (offsets in 1/65536 of a cell), so they do not depend on the order of addition: chunks, threads,
 files and workers may add in any order and the result is the same to the last bit.
 """
@@ -16,24 +19,82 @@ from scanfind.kernels.blocks import BIAS, find_block, insert_block, pack_block, 
 MOMENTS = 13  # n, Σx Σy Σz, Σxx Σxy Σxz Σyy Σyz Σzz, Σ direction to the scanner (3)
 OFFSET_UNITS = 65536.0  # offsets within a cell are counted in 1/65536 of its edge: 0.3 µm in a cell of 2 cm
 DIRECTION_UNITS = 1048576.0
-FARTHEST = 1e6  # metres: no scanner looks so far; some exporters write 1e38 for "no data"
+NO_BEAM = np.int64(1 << 62)
+# A beam's range is kept to 0.06 mm and its direction to a 256th of a pixel, 0.14 mm at 8 m.
+RANGE_UNITS, AIM_UNITS = 16384.0, 256
 ROWS_OF_OCTANT = 64 * 54  # 64 cells, each seen in every one of the bins below
+# Shards lie in one array and take its rows and blocks by lots: large enough that two never write to one page often,
+# small enough that what the last lots leave unused is little (0.4 MB and 0.1 MB a shard).
+ROWS_A_LOT, BLOCKS_A_LOT = 1 << 12, 1 << 6
 VIEW_BINS = 3  # a view direction is one of 6 cube faces × 3 × 3: two in one bin are less than 35° apart
+
+
+@njit(cache=True, nogil=True)
+def cube_place(x, y, z):
+    """Where a direction (any length but 0) meets a cube: its face, and the place on it, each from -1 to 1."""
+    ax, ay, az = abs(x), abs(y), abs(z)
+    if ax >= ay and ax >= az:
+        return (0 if x > 0 else 1), y / ax, z / ax
+    if ay >= az:
+        return (2 if y > 0 else 3), x / ay, z / ay
+    return (4 if z > 0 else 5), x / az, y / az
+
+
+@njit(cache=True, nogil=True)
+def pixel_at(face, u, v, edge):
+    """The pixel of a cube map of 6 × edge × edge at a place on the cube."""
+    iu = min(edge - 1, int((u + 1.0) * 0.5 * edge))
+    iv = min(edge - 1, int((v + 1.0) * 0.5 * edge))
+    return (face * edge + iu) * edge + iv
+
+
+@njit(cache=True, nogil=True)
+def pack_beam(face, u, v, edge, distance):
+    """The pixel of a beam, and in one int64 how far it went and where within the pixel: of two the nearer is less."""
+    along, across = (u + 1.0) * 0.5 * edge, (v + 1.0) * 0.5 * edge
+    iu, iv = min(edge - 1, int(along)), min(edge - 1, int(across))
+    aim_u = min(AIM_UNITS - 1, int((along - iu) * AIM_UNITS))
+    aim_v = min(AIM_UNITS - 1, int((across - iv) * AIM_UNITS))
+    return (face * edge + iu) * edge + iv, (np.int64(distance * RANGE_UNITS) << 16) | (aim_u << 8) | aim_v
+
+
+@njit(cache=True, nogil=True)
+def unpack_beam(pixel, packed, edge):
+    """Unit direction and range of a beam, and the solid angle of its pixel."""
+    face, iu, iv = pixel // (edge * edge), pixel // edge % edge, pixel % edge
+    u = (iu + (((packed >> 8) & 255) + 0.5) / AIM_UNITS) * 2.0 / edge - 1.0
+    v = (iv + ((packed & 255) + 0.5) / AIM_UNITS) * 2.0 / edge - 1.0
+    major = 1.0 if face % 2 == 0 else -1.0
+    length = sqrt(1.0 + u * u + v * v)
+    major, u, v = major / length, u / length, v / length
+    x, y, z = (major, u, v) if face < 2 else ((u, major, v) if face < 4 else (u, v, major))
+    return x, y, z, (packed >> 16) / RANGE_UNITS, 4.0 / (edge * edge) / length**3
 
 
 @njit(cache=True, nogil=True)
 def cube_pixel(x, y, z, edge):
     """The pixel of a cube map of 6 × edge × edge a direction (any length but 0) falls into."""
-    ax, ay, az = abs(x), abs(y), abs(z)
-    if ax >= ay and ax >= az:
-        face, major, u, v = (0 if x > 0 else 1), ax, y, z
-    elif ay >= az:
-        face, major, u, v = (2 if y > 0 else 3), ay, x, z
-    else:
-        face, major, u, v = (4 if z > 0 else 5), az, x, y
-    iu = min(edge - 1, int((u / major + 1.0) * 0.5 * edge))
-    iv = min(edge - 1, int((v / major + 1.0) * 0.5 * edge))
-    return (face * edge + iu) * edge + iv
+    face, u, v = cube_place(x, y, z)
+    return pixel_at(face, u, v, edge)
+
+
+@njit(cache=True, nogil=True)
+def owner_of(key, shards):
+    """The shard a block belongs to: neighbours mostly to different ones, so that each has its share of any surface."""
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    return np.int64((mixed >> np.uint64(52)) % np.uint64(shards))
+
+
+@njit(cache=True, nogil=True)
+def place_of(used, lot, shard, shards):
+    """Where in an array the `used`-th thing of a shard lies: the shards take lots of it in turn."""
+    return ((used // lot) * shards + shard) * lot + used % lot
+
+
+@njit(cache=True, nogil=True)
+def room_for(size, lot, shards):
+    """How many things each shard can lay in an array of a size."""
+    return size // (lot * shards) * lot
 
 
 @njit(cache=True, nogil=True)
@@ -46,14 +107,25 @@ def row_of_view(block_cells, links, block, local, view):
 
 
 @njit(cache=True, nogil=True)
-def add_row(block_cells, links, moments, counts, block, local, view):
+def add_row(block_cells, links, moments, counts, shard, shards, block, local, view):
     """A new, empty row for a view of a cell, first in the cell's chain; there must be room."""
-    row = counts[1]
+    row = place_of(counts[1], ROWS_A_LOT, shard, shards)
     counts[1] += 1
     links[row, 0], links[row, 1] = view, block_cells[block, local]
     block_cells[block, local] = row
     moments[row, :] = 0
     return row
+
+
+@njit(cache=True, nogil=True)
+def add_block(hash_keys, hash_values, block_keys, block_cells, counts, shard, shards, key):
+    """A new block with no cell in it; there must be room."""
+    block = place_of(counts[0], BLOCKS_A_LOT, shard, shards)
+    counts[0] += 1
+    block_keys[block] = key
+    block_cells[block, :] = -1
+    insert_block(hash_keys, hash_values, key, block)
+    return block
 
 
 @njit(cache=True, nogil=True)
@@ -76,110 +148,114 @@ def add_child(parents, p, children, c, ex, ey, ez):
 
 @njit(cache=True, nogil=True)
 def accumulate(
-    points, start, origin, has_origin, offset, cell,
-    hash_keys, hash_values, block_keys, block_cells, moments, links, counts,
+    points, start, origin, has_origin, offset, cell, shard, shards,
+    hash_keys, hash_values, block_keys, block_cells, moments, links, counts, nearest, edge,
 ):  # fmt: skip
-    """Add points[start:] to the grid; returns how far it came: len(points), or less where an array is full.
+    """Add those of points[start:] that lie in a shard's blocks; returns how far it came: len(points), or less where an
+    array is full.
 
     offset : (3,) the grid's own origin, the points' frame
-    hash_keys, hash_values : open addressing, power of two
+    hash_keys, hash_values : of the shard's blocks; open addressing, power of two
     block_keys : (B,) packed; block_cells : (B, 512) a row of each cell's moments, -1 for an empty cell
     moments : (R, 13) one row for each cell and view; links : (R, 2) the row's view, and the cell's next row or -1
-    counts : [blocks used, rows used, points too far away to be addressed]
+    counts : the shard's [blocks used, rows used, points too far away to be addressed (told by shard 0)]
+    nearest : (6·edge²,) the nearest beam the shard knows of in each pixel about the scanner (pack_beam), or NO_BEAM
     """
     inverse = 1.0 / cell
     n = points.shape[0]
+    most_blocks = room_for(block_keys.shape[0], BLOCKS_A_LOT, shards)
+    most_rows = room_for(moments.shape[0], ROWS_A_LOT, shards)
     last_key = np.int64(-1)
     last_block = np.int64(-1)
+    mine = True
+    row = last_cell = np.int64(-1)
     view = np.int64(0)
-    dx = dy = dz = 0.0
+    dx = dy = dz = distance = 0.0
     for i in range(start, n):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         gx, gy, gz = (px - offset[0]) * inverse, (py - offset[1]) * inverse, (pz - offset[2]) * inverse
         # Before floor, which makes an int64 of it: the 1e38 some exporters write for "no data" would wrap round.
         if not (abs(gx) < 8 * (BIAS - 2) and abs(gy) < 8 * (BIAS - 2) and abs(gz) < 8 * (BIAS - 2)):
-            counts[2] += 1
+            counts[2] += shard == 0
             continue
         fx, fy, fz = floor(gx), floor(gy), floor(gz)
         cx, cy, cz = np.int64(fx), np.int64(fy), np.int64(fz)
-        if has_origin:
-            dx, dy, dz = origin[0] - px, origin[1] - py, origin[2] - pz
-            view = cube_pixel(dx, dy, dz, VIEW_BINS) if dx != 0.0 or dy != 0.0 or dz != 0.0 else 0
         key = pack_block(cx >> 3, cy >> 3, cz >> 3)
         if key != last_key:
-            last_block = find_block(hash_keys, hash_values, key)
-            if last_block < 0:
-                if counts[0] == block_keys.shape[0]:
-                    return i
-                last_block = counts[0]
-                block_keys[last_block] = key
-                block_cells[last_block, :] = -1
-                insert_block(hash_keys, hash_values, key, last_block)
-                counts[0] += 1
-            last_key = key
+            last_key, last_cell = key, np.int64(-1)
+            mine = owner_of(key, shards) == shard
+            if mine:
+                last_block = find_block(hash_keys, hash_values, key)
+                if last_block < 0:
+                    if counts[0] == most_blocks:
+                        return i
+                    last_block = add_block(hash_keys, hash_values, block_keys, block_cells, counts, shard, shards, key)
+        if not mine:
+            continue
+        if has_origin:
+            dx, dy, dz = px - origin[0], py - origin[1], pz - origin[2]
+            distance = sqrt(dx * dx + dy * dy + dz * dz)
+            view = np.int64(0)
+            if distance > 0.0:
+                face, u, v = cube_place(dx, dy, dz)
+                view = pixel_at(face, u, v, VIEW_BINS)
+                pixel, beam = pack_beam(face, u, v, edge, distance)
+                nearest[pixel] = min(nearest[pixel], beam)
         local = ((cx & 7) << 6) | ((cy & 7) << 3) | (cz & 7)
-        row = row_of_view(block_cells, links, last_block, local, view)
-        if row < 0:
-            if counts[1] == moments.shape[0]:
-                return i
-            row = add_row(block_cells, links, moments, counts, last_block, local, view)
+        # Points come along scan lines: most lie in the cell of the one before.
+        if local * 64 + view != last_cell:
+            last_cell = np.int64(-1)
+            row = row_of_view(block_cells, links, last_block, local, view)
+            if row < 0:
+                if counts[1] == most_rows:
+                    return i
+                row = add_row(block_cells, links, moments, counts, shard, shards, last_block, local, view)
+            last_cell = local * 64 + view
         ox = np.int64(floor((gx - fx - 0.5) * OFFSET_UNITS + 0.5))
         oy = np.int64(floor((gy - fy - 0.5) * OFFSET_UNITS + 0.5))
         oz = np.int64(floor((gz - fz - 0.5) * OFFSET_UNITS + 0.5))
-        m = moments[row]
-        m[0] += 1
-        m[1] += ox
-        m[2] += oy
-        m[3] += oz
-        m[4] += ox * ox
-        m[5] += ox * oy
-        m[6] += ox * oz
-        m[7] += oy * oy
-        m[8] += oy * oz
-        m[9] += oz * oz
-        if has_origin:
-            distance = sqrt(dx * dx + dy * dy + dz * dz)
-            if distance > 0.0:
-                scale = DIRECTION_UNITS / distance
-                m[10] += np.int64(dx * scale)
-                m[11] += np.int64(dy * scale)
-                m[12] += np.int64(dz * scale)
+        moments[row, 0] += 1
+        moments[row, 1] += ox
+        moments[row, 2] += oy
+        moments[row, 3] += oz
+        moments[row, 4] += ox * ox
+        moments[row, 5] += ox * oy
+        moments[row, 6] += ox * oz
+        moments[row, 7] += oy * oy
+        moments[row, 8] += oy * oz
+        moments[row, 9] += oz * oz
+        if has_origin and distance > 0.0:
+            scale = DIRECTION_UNITS / distance
+            moments[row, 10] -= np.int64(dx * scale)
+            moments[row, 11] -= np.int64(dy * scale)
+            moments[row, 12] -= np.int64(dz * scale)
     return n
 
 
 @njit(cache=True, nogil=True)
-def note_ranges(points, origin, depth, edge):
-    """Keep the nearest range in each direction from a scanner; depth : (6·edge²,) metres, inf where there is none."""
-    for i in range(points.shape[0]):
-        dx, dy, dz = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
-        distance = sqrt(dx * dx + dy * dy + dz * dz)
-        if 0.0 < distance < FARTHEST:
-            pixel = cube_pixel(dx, dy, dz, edge)
-            depth[pixel] = min(depth[pixel], np.float32(distance))
-
-
-@njit(cache=True, nogil=True)
 def sum_children(
-    start, child_keys, child_cells, child_moments, child_links, half,
+    start, children, child_keys, child_cells, child_moments, child_links, half, shard, shards,
     hash_keys, hash_values, block_keys, block_cells, moments, links, counts,
 ):  # fmt: skip
-    """Sum cells into cells of twice the edge, from child block `start` on; returns how far it came (see accumulate).
+    """Sum cells into those of a shard's blocks, of twice the edge; returns how far it came (see accumulate).
 
+    children : where the child blocks lie, of which those from `start` on are summed
     half : half a child's edge in offset units: a child's centre lies so far from its parent's, along each axis
     """
-    for child in range(start, child_keys.shape[0]):
-        # A child block fills one octant of its parent: at most one new block, and 64 new cells with all their views.
-        if counts[0] + 1 > block_keys.shape[0] or counts[1] + ROWS_OF_OCTANT > moments.shape[0]:
-            return child
+    most_blocks = room_for(block_keys.shape[0], BLOCKS_A_LOT, shards)
+    most_rows = room_for(moments.shape[0], ROWS_A_LOT, shards)
+    for at in range(start, children.shape[0]):
+        child = children[at]
         bx, by, bz = unpack_block(child_keys[child])
         key = pack_block(bx >> 1, by >> 1, bz >> 1)
+        if owner_of(key, shards) != shard:
+            continue
+        # A child block fills one octant of its parent: at most one new block, and 64 new cells with all their views.
+        if counts[0] + 1 > most_blocks or counts[1] + ROWS_OF_OCTANT > most_rows:
+            return at
         block = find_block(hash_keys, hash_values, key)
         if block < 0:
-            block = counts[0]
-            block_keys[block] = key
-            block_cells[block, :] = -1
-            insert_block(hash_keys, hash_values, key, block)
-            counts[0] += 1
+            block = add_block(hash_keys, hash_values, block_keys, block_cells, counts, shard, shards, key)
         for local in range(512):
             child_row = np.int64(child_cells[child, local])
             if child_row < 0:
@@ -194,7 +270,7 @@ def sum_children(
                 view = np.int64(child_links[child_row, 0])
                 row = row_of_view(block_cells, links, block, parent, view)
                 if row < 0:
-                    row = add_row(block_cells, links, moments, counts, block, parent, view)
+                    row = add_row(block_cells, links, moments, counts, shard, shards, block, parent, view)
                 add_child(moments, row, child_moments, child_row, ex, ey, ez)
                 child_row = np.int64(child_links[child_row, 1])
-    return child_keys.shape[0]
+    return children.shape[0]

@@ -51,23 +51,44 @@ def nearest_surfel(
 
 
 @njit(cache=True, nogil=True)
-def mark_around(points, reach, cell, hash_keys, hash_values, block_rows, marked):
-    """Mark the rows of occupied cells up to `reach` cells from those points (N, 3) lie in; marked : bool, in place."""
+def mark_around(points, reach, cell, hash_keys, hash_values, layers):
+    """Mark the cells up to `reach` cells, at most 8, from those points (N, 3) lie in.
+
+    layers : (B, 8) uint64, in place: a bit for each cell of a block, eight words of eight by eight. A cube of cells is
+        a few words of a few blocks: ten times faster than cell by cell.
+    """
     inverse = 1.0 / cell
+    last = np.empty(3, np.int64)
     for i in range(points.shape[0]):
-        cx = np.int64(floor(points[i, 0] * inverse))
-        cy = np.int64(floor(points[i, 1] * inverse))
-        cz = np.int64(floor(points[i, 2] * inverse))
-        key, block = np.int64(-1), np.int64(-1)
-        for ix in range(cx - reach, cx + reach + 1):
-            for iy in range(cy - reach, cy + reach + 1):
-                for iz in range(cz - reach, cz + reach + 1):
-                    here = pack_block(ix >> 3, iy >> 3, iz >> 3)
-                    if here != key:
-                        key = here
-                        block = find_block(hash_keys, hash_values, key)
+        x, y, z = floor(points[i, 0] * inverse), floor(points[i, 1] * inverse), floor(points[i, 2] * inverse)
+        if i > 0 and x == last[0] and y == last[1] and z == last[2]:
+            continue
+        last[0], last[1], last[2] = x, y, z
+        for bx in range((x - reach) >> 3, ((x + reach) >> 3) + 1):
+            for by in range((y - reach) >> 3, ((y + reach) >> 3) + 1):
+                for bz in range((z - reach) >> 3, ((z + reach) >> 3) + 1):
+                    block = find_block(hash_keys, hash_values, pack_block(bx, by, bz))
                     if block < 0:
                         continue
-                    row = block_rows[block, ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7)]
+                    z0, z1 = max(z - reach - (bz << 3), 0), min(z + reach - (bz << 3), 7)
+                    run = ((np.uint64(1) << np.uint64(z1 - z0 + 1)) - np.uint64(1)) << np.uint64(z0)
+                    word = np.uint64(0)
+                    for ly in range(max(y - reach - (by << 3), 0), min(y + reach - (by << 3), 7) + 1):
+                        word |= run << np.uint64(8 * ly)
+                    for lx in range(max(x - reach - (bx << 3), 0), min(x + reach - (bx << 3), 7) + 1):
+                        layers[block, lx] |= word
+
+
+@njit(cache=True, nogil=True)
+def mark_rows(blocks, layers, block_rows, marked):
+    """Mark the rows (bool, in place) of the occupied ones of the cells marked in some blocks."""
+    for block in blocks:
+        for lx in range(8):
+            word = layers[block, lx]
+            if word == 0:
+                continue
+            for place in range(64):
+                if (word >> np.uint64(place)) & np.uint64(1):
+                    row = block_rows[block, (lx << 6) | place]
                     if row >= 0:
                         marked[row] = True

@@ -8,15 +8,35 @@ from scanfind.kernels.placed import placed
 
 
 @njit(cache=True, nogil=True)
-def self_overlap(points, normals, some, rotation, translation, reach):
-    """Share of the first `some` samples that a motion brings within `reach` metres of a sample with a like normal."""
+def self_overlap(points, normals, signed, some, rotation, translation, reach):
+    """Share of the first `some` samples that a motion brings within `reach` metres of a sample with a like normal.
+
+    signed : False where nobody knows which way the normals face
+    """
     hits = 0
     for i in range(some):
         x, y, z, nx, ny, nz = placed(points, normals, i, rotation, translation)
         for j in range(points.shape[0]):
             dx, dy, dz = points[j, 0] - x, points[j, 1] - y, points[j, 2] - z
             along = nx * normals[j, 0] + ny * normals[j, 1] + nz * normals[j, 2]
-            if dx * dx + dy * dy + dz * dz <= reach * reach and along > 0.7:
+            if dx * dx + dy * dy + dz * dz <= reach * reach and (along if signed else abs(along)) > 0.7:
                 hits += 1
                 break
     return hits / max(some, 1)
+
+
+@njit(cache=True, nogil=True)
+def count_shifts(points, normals, signed, per_metre, reach, table):
+    """Count, in cells of a table (2 a + 1, 2 b + 1, 2 c + 1), the shifts that lead from a sample to one of like normal.
+
+    per_metre : cells a metre; reach : (a, b, c), the cell of no shift
+    """
+    for i in range(points.shape[0]):
+        for j in range(i):
+            along = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
+            if (along if signed else abs(along)) > 0.9:
+                u = int(round((points[i, 0] - points[j, 0]) * per_metre))
+                v = int(round((points[i, 1] - points[j, 1]) * per_metre))
+                w = int(round((points[i, 2] - points[j, 2]) * per_metre))
+                table[reach[0] + u, reach[1] + v, reach[2] + w] += 1
+                table[reach[0] - u, reach[1] - v, reach[2] - w] += 1

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scanfind.errors import UsageError
 from scanfind.pose import Pose
-from scanfind.simulate.rays import RayCaster
+from scanfind.rays import RayCaster
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

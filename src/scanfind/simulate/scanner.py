@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from scanfind.cloud import PointCloud, as_points
 from scanfind.errors import UsageError
 from scanfind.pose import Pose
+from scanfind.rays import RayCaster
 from scanfind.simulate.instruments import Instrument, Scanner
-from scanfind.simulate.rays import RayCaster
 from scanfind.simulate.scene import BACKGROUND, Scene
 
 __all__ = ["Block", "Scanner", "SimulatedScan", "Survey", "scan", "shares"]

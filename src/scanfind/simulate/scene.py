@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose
+from scanfind.rays import RayCaster
 from scanfind.simulate.placement import surface_points
-from scanfind.simulate.rays import RayCaster
 
 Floats = NDArray[np.float64]
 

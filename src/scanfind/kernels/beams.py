@@ -1,0 +1,35 @@
+"""Beams about a scanner: which of them go towards a placed model, and where each went."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+from numba import njit
+
+from scanfind.kernels.grid import cube_place, unpack_beam
+
+
+@njit(cache=True, nogil=True)
+def mark_towards(points, origin, reach, edge, marked):
+    """Mark the pixels about a scanner within `reach` metres of points (N, 3); marked : (6·edge²,) bool."""
+    for i in range(points.shape[0]):
+        dx, dy, dz = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+        if dx == 0.0 and dy == 0.0 and dz == 0.0:
+            continue
+        face, u, v = cube_place(dx, dy, dz)
+        # A metre across the line of sight is so much on the face, which is closest in its middle.
+        wide = reach / sqrt(dx * dx + dy * dy + dz * dz) * (1.0 + u * u + v * v)
+        low_u, high_u = int((u - wide + 1.0) * 0.5 * edge), int((u + wide + 1.0) * 0.5 * edge)
+        low_v, high_v = int((v - wide + 1.0) * 0.5 * edge), int((v + wide + 1.0) * 0.5 * edge)
+        for iu in range(max(0, low_u), min(edge - 1, high_u) + 1):
+            for iv in range(max(0, low_v), min(edge - 1, high_v) + 1):
+                marked[(face * edge + iu) * edge + iv] = True
+
+
+@njit(cache=True, nogil=True)
+def beams_of(pixels, nearest, edge, directions, ranges, angles):
+    """Unit directions (B, 3), ranges and solid angles (B,) of the beams in some pixels (B,)."""
+    for i in range(pixels.shape[0]):
+        x, y, z, distance, angle = unpack_beam(pixels[i], nearest[pixels[i]], edge)
+        directions[i, 0], directions[i, 1], directions[i, 2] = x, y, z
+        ranges[i], angles[i] = distance, angle
