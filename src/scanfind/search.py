@@ -44,7 +44,7 @@ BEND_BORDERS = (0.02, 0.05, 0.1)
 # A pair that lies on an instance finds it when noise left its feature in the right cell of the hash table and one of
 # the model's pairs there is near enough: measured 0.5 on spools, 0.05 – 0.4 on frames, and on sparse ones far less. Only
 # until an instance is found; then it is counted (Search.learn).
-RIGHT_PAIR_FINDS = 0.012
+RIGHT_PAIR_FINDS = 0.006
 # A surfel's normal counts as clean below so much of a cell, noise apart; but never fewer than this share of a shape's.
 # Drawing only those doubled the right poses a round finds, on spools and frames.
 CLEAN_CELLS, CLEAN_SHARE = 0.1, 0.3
