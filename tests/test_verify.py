@@ -190,7 +190,9 @@ def test_what_beams_say_is_what_plain_rays_say(seed: int) -> None:
     beams = beams_about(np.zeros(3), rng.permutation(points_seen())[:300])
     told = spoken_of(box(), caster_of(box()), placed, [beams], limits)
     expected = naive.spoken(placed.move(corners_of(box())), points_of(beams), limits)
-    np.testing.assert_allclose(told, expected, rtol=1e-3, atol=1e-9)
+    # A beam or two that graze an edge or a limit may go either way.
+    np.testing.assert_allclose(told, expected, rtol=0, atol=3e-4)
+    assert sum(expected) > 1e-3
 
 
 def test_moving_everything_changes_nothing_a_beam_says() -> None:
