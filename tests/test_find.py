@@ -41,7 +41,7 @@ QUICK = Parameters(
     grid=GridParameters(cell_m=0.02),
     surface=SurfaceParameters(samples=1000),
     search=replace(
-        PRESETS["default"].search, time_limit_s=20.0, pairs_a_round=8000, hypotheses_a_round=60_000, kept=24
+        PRESETS["default"].search, time_limit_s=None, pairs_a_round=8000, hypotheses_a_round=60_000, kept=24
     ),
 )
 ONE = replace(QUICK, search=replace(QUICK.search, max_instances=1))

@@ -51,7 +51,8 @@ class DepthMap(NamedTuple):
         """Pixels of twice the edge, each the nearest of its four."""
         half = self.edge // 2
         pixels = self.ranges.reshape(6, half, 2, half, 2)
-        return DepthMap(self.origin, pixels.min(axis=(2, 4)).reshape(-1), half)
+        rows = np.minimum(pixels[:, :, 0], pixels[:, :, 1])
+        return DepthMap(self.origin, np.minimum(rows[..., 0], rows[..., 1]).reshape(-1), half)
 
     def spoken(self) -> float:
         """The share of what was looked at where a sample gets an answer: its pixel and those beside it mostly full."""

@@ -104,26 +104,26 @@ class Towards(NamedTuple):
 
 def towards(model: Model, placed: Pose, scanners: Sequence[Beams]) -> Towards:
     """The beams that go towards a placed model, MOST_BEAMS of them where there are more."""
-    from scanfind.kernels.beams import beams_of, mark_towards
-    from scanfind.kernels.grid import NO_BEAM
+    from scanfind.kernels.beams import beams_of, pixels_towards
 
-    points, pixels = placed.move(model.samples.points), []
+    points, reach, pixels = placed.move(model.samples.points), REACH_SPACINGS * model.spacing, []
     for scanner in scanners:
-        marked = np.zeros(len(scanner.nearest), np.bool_)
-        mark_towards(points, scanner.origin, REACH_SPACINGS * model.spacing, scanner.edge, marked)
-        pixels.append(np.flatnonzero(marked & (scanner.nearest < NO_BEAM)))
+        met, found = np.zeros(len(scanner.nearest), np.bool_), np.empty(len(scanner.nearest), np.int64)
+        count = pixels_towards(points, scanner.origin, reach, scanner.edge, scanner.nearest, met, found)
+        pixels.append(found[:count])
     share = min(1.0, MOST_BEAMS / max(sum(map(len, pixels)), 1))
-    found = [Towards(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))]
+    asked_for = [Towards(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))]
     for scanner, some in zip(scanners, pixels, strict=True):
         asked = some[lots(some) < share]
         directions, ranges, angles = np.empty((len(asked), 3)), np.empty(len(asked)), np.empty(len(asked))
         beams_of(asked, scanner.nearest, scanner.edge, directions, ranges, angles)
         # Each of those asked stands for as many as were left out.
-        found.append(Towards(np.broadcast_to(scanner.origin, directions.shape), directions, ranges, angles / share))
-    return Towards(*(np.concatenate(column) for column in zip(*found, strict=True)))
+        origins = np.broadcast_to(scanner.origin, directions.shape)
+        asked_for.append(Towards(origins, directions, ranges, angles / share))
+    return Towards(*(np.concatenate(column) for column in zip(*asked_for, strict=True)))
 
 
-def lots(numbers: NDArray[np.intp]) -> Floats:
+def lots(numbers: NDArray[np.int64]) -> Floats:
     """A number in 0 … 1 for each of some numbers, the same for the same one, without pattern (Fibonacci hashing)."""
     mixed = numbers.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     return (mixed >> np.uint64(11)).astype(np.float64) / 2.0**53

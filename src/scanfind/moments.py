@@ -9,7 +9,7 @@ from __future__ import annotations
 import mmap
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
+from functools import partial, reduce
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -125,7 +125,7 @@ class MomentGrid:
         """Join what the shards noted from the scanner of the last chunk: a map for each of 50 stations is enough."""
         if self._looking is not None:
             key, seen = self._looking
-            nearest = seen.min(axis=0)
+            nearest = reduce(np.minimum, seen)
             self._beams[key] = np.minimum(self._beams[key], nearest) if key in self._beams else nearest
             self._looking = None
 

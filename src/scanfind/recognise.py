@@ -102,6 +102,7 @@ class Recognition:
         diameters = np.array([model.diameter for model in models])
         # Poses closer than a thirtieth of the diameter meet in one ICP; after it a hundredth tells them apart.
         self._apart_before, self._apart_after = diameters / 30.0, diameters / 100.0
+        self._the_same = diameters / 1000.0
         self._drawn_in = diameters / 10.0
         self._casters: dict[int, RayCaster] = {}
         view = View(scene, self._fine, self._thin, self.signed, parameters.verify)
@@ -143,7 +144,10 @@ class Recognition:
             return self._icp_fine(hypotheses)
         better = met.take(np.argsort(-np.concatenate([r.matched for r in rough]), kind="stable"))
         better = better.take(distinct(better, self.arrays, self._apart_after, kept, 2 * kept))
-        return self._icp_fine(better.take(self._promising(better, REFUSED_SHOWN)))
+        fine = self._icp_fine(better.take(self._promising(better, REFUSED_SHOWN)))
+        fine = fine.take(np.argsort(-fine.matched, kind="stable"))
+        # What ended at one place is asked once.
+        return fine.take(distinct(fine.hypotheses, self.arrays, self._the_same, kept, 2 * kept))
 
     def _promising(self, hypotheses: Hypotheses, shown: int) -> NDArray[np.intp]:
         """Those whose evidence on the coarse surfels is not hopeless, and the best `shown` of each model (indices)."""

@@ -58,6 +58,10 @@ class Refined(NamedTuple):
     matched: Floats
     rms: Floats
 
+    def take(self, which: NDArray[np.intp]) -> Refined:
+        """Some of them, in that order."""
+        return Refined(self.hypotheses.take(which), self.hessians[which], self.matched[which], self.rms[which])
+
 
 def icp(
     hypotheses: Hypotheses, surfels: Surfels, arrays: ModelArrays, signed: bool, gates: Floats, most_samples: int,

@@ -30,11 +30,12 @@ LEARNT = 0.5
 # Cells drawn from: fewer make pairs that repeat each other, more cost more to fit than they add to a round's pairs.
 LEAST_POOL, MOST_POOL = 20_000, 100_000
 ROUNDS_A_POOL = 4  # draw from mostly the same cells, which are fitted then; small parts need others in the long run
-# The first round tells how easily an instance is found, and often finds all there is. Rounds after it: a little more than
-# is missing, and enough to be worth refining.
+# The first round tells how easily an instance is found, and often finds all there is. Rounds after it: a little more
+# than is missing, and enough to be worth refining.
 FIRST_ROUND, ROUND_MARGIN, LEAST_ROUND = 0.3, 1.1, 0.15
 # With so many scanner positions nearly every sample faces one, and asking costs more than it tells.
 FACING_ORIGINS = 6
+SHAPED = 1000  # samples whose shape tells that of a model, each against all of them
 PARTNERS_COUNTED = 40  # surfels whose partners are counted, each against all of the pool
 # Bins a pair distance: 1,600 of them make the shell a partner is sought in (kernels.search.draw_seconds).
 BINS_A_DISTANCE = 6
@@ -42,9 +43,9 @@ BINS_A_DISTANCE = 6
 # windows over 0.1 m, a pipe as wide as the window above the last.
 BEND_BORDERS = (0.02, 0.05, 0.1)
 # A pair that lies on an instance finds it when noise left its feature in the right cell of the hash table and one of
-# the model's pairs there is near enough: measured 0.5 on spools, 0.05 – 0.4 on frames, and on sparse ones far less. Only
+# the model's pairs there is near enough: measured 0.5 on spools, 0.05 – 0.4 on frames, far less on sparse ones. Only
 # until an instance is found; then it is counted (Search.learn).
-RIGHT_PAIR_FINDS = 0.012
+RIGHT_PAIR_FINDS = 0.006
 # A surfel's normal counts as clean below so much of a cell, noise apart; but never fewer than this share of a shape's.
 # Drawing only those doubled the right poses a round finds, on spools and frames.
 CLEAN_CELLS, CLEAN_SHARE = 0.1, 0.3
@@ -472,7 +473,8 @@ def model_shape(model: Model, window: float) -> Floats:
     """Share of a model's samples in each class, (C,); none is quite zero: scan and model are not sampled alike."""
     from scanfind.kernels.shape import bend_of_samples
 
-    bends = np.empty(len(model.samples))
+    # The first ones lie as evenly over the model as all of them.
+    bends = np.empty(min(len(model.samples), SHAPED))
     bend_of_samples(model.samples.points, model.samples.normals, window, bends)
     shares = np.bincount(shape_classes(bends, window), minlength=len(BEND_BORDERS) + 1) / len(bends)
     return np.asarray((shares + 0.02) / (shares + 0.02).sum())

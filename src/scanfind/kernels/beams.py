@@ -6,12 +6,17 @@ from math import sqrt
 
 from numba import njit
 
-from scanfind.kernels.grid import cube_place, unpack_beam
+from scanfind.kernels.grid import NO_BEAM, cube_place, unpack_beam
 
 
 @njit(cache=True, nogil=True)
-def mark_towards(points, origin, reach, edge, marked):
-    """Mark the pixels about a scanner within `reach` metres of points (N, 3); marked : (6·edge²,) bool."""
+def pixels_towards(points, origin, reach, edge, nearest, met, pixels):
+    """The pixels within `reach` metres of points (N, 3) in which a scanner has a beam; returns how many.
+
+    nearest : (6·edge²,) the scanner's beams (kernels.grid.pack_beam); met : the same long, all False
+    pixels : out, the first so many of at most 6·edge²
+    """
+    count = 0
     for i in range(points.shape[0]):
         dx, dy, dz = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
         if dx == 0.0 and dy == 0.0 and dz == 0.0:
@@ -23,7 +28,12 @@ def mark_towards(points, origin, reach, edge, marked):
         low_v, high_v = int((v - wide + 1.0) * 0.5 * edge), int((v + wide + 1.0) * 0.5 * edge)
         for iu in range(max(0, low_u), min(edge - 1, high_u) + 1):
             for iv in range(max(0, low_v), min(edge - 1, high_v) + 1):
-                marked[(face * edge + iu) * edge + iv] = True
+                pixel = (face * edge + iu) * edge + iv
+                if not met[pixel] and nearest[pixel] < NO_BEAM:
+                    met[pixel] = True
+                    pixels[count] = pixel
+                    count += 1
+    return count
 
 
 @njit(cache=True, nogil=True)

@@ -13,12 +13,13 @@ from scanfind.kernels.surfels import smallest_eigenvector
 
 @njit(cache=True, nogil=True)
 def bend_of_samples(points, normals, window, bends):
-    """Standard deviation across the plane fitted to a model's samples in a cube of edge `window` metres, (N,), metres.
+    """Standard deviation across the plane fitted to a model's samples in a cube of edge `window` metres about each of
+    the first B of them, (B,), metres.
 
     Only samples that face the same way as the one in the middle count: a scanner sees them together.
     """
     half = 0.5 * window
-    for i in range(points.shape[0]):
+    for i in range(bends.shape[0]):
         n = sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
         for j in range(points.shape[0]):
             x, y, z = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
