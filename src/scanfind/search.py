@@ -28,7 +28,7 @@ AREA_OF_A_SAMPLE = 1.4
 # What was found first was easier to find than what was not: its rate is halved before it is asked of others.
 LEARNT = 0.5
 # Cells drawn from: fewer make pairs that repeat each other, more cost more to fit than they add to a round's pairs.
-LEAST_POOL, MOST_POOL = 20_000, 100_000
+LEAST_POOL, MOST_POOL = 20_000, 60_000
 ROUNDS_A_POOL = 4  # draw from mostly the same cells, which are fitted then; small parts need others in the long run
 # The first round tells how easily an instance is found, and often finds all there is. Rounds after it: a little more
 # than is missing, and enough to be worth refining.
