@@ -12,8 +12,6 @@ BIN := $(VENV)/bin
 DEMO ?= demo
 SEEDS ?= 5000-5019
 QUICK ?= paper-quick
-# Python compiles what it imports, a tenth of the 7,000 files installed: compiling all took half of installing.
-PIP_INSTALL := $(BIN)/pip install --quiet --no-compile
 SOURCES := $(shell find src -name '*.py')
 # An index out of bounds corrupts silently in compiled code: these run once with every access checked.
 KERNEL_TESTS := $(wildcard $(foreach stage,near_surface isolate surface pairs surfels search verify refine scene onto_itself,\
@@ -65,15 +63,15 @@ page: $(VENV)/benched
 
 # The developers' install is editable and so never out of date; where it is there, users' work is done with it.
 $(VENV)/installed: pyproject.toml $(SOURCES) | $(BIN)/python
-	test -f $(VENV)/developed || $(PIP_INSTALL) .
+	test -f $(VENV)/developed || $(BIN)/pip install --quiet .
 	touch $@
 
 $(VENV)/developed: pyproject.toml | $(BIN)/python
-	$(PIP_INSTALL) --editable '.[dev]'
+	$(BIN)/pip install --quiet --editable '.[dev]'
 	touch $@
 
 $(VENV)/benched: pyproject.toml | $(BIN)/python
-	$(PIP_INSTALL) --editable '.[bench]'
+	$(BIN)/pip install --quiet --editable '.[bench]'
 	touch $@
 
 $(BIN)/python:

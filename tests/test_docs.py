@@ -133,6 +133,7 @@ def test_the_examples_of_every_help_run(
     shutil.copy(ROOT / "examples" / "pump" / "scan.e57", tmp_path / "shop.e57")
     shutil.copy(shared_data / "cad" / "box_sides.STEP", tmp_path / "frame.step")
     trimesh.creation.cylinder(radius=88.0, height=600.0).export(tmp_path / "spool.stl")
+    trimesh.creation.annulus(r_min=50.0, r_max=90.0, height=20.0).export(tmp_path / "flange.stl")
     (chunk,) = read_scan(tmp_path / "shop.e57")
     for name, half in (("station1.laz", slice(None, None, 2)), ("station2.laz", slice(1, None, 2))):
         with open_writer(tmp_path / name, {"intensity": np.dtype(np.uint16)}) as writer:
