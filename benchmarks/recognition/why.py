@@ -1,0 +1,102 @@
+"""Why something was missed or believed: the search's own evidence at a pose, and what a perfect scan would say."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmarks.recognition.parts import Part, library_of
+from benchmarks.recognition.trial import Trial
+from scanfind.library import joint_table
+from scanfind.model import Model
+from scanfind.moments import MomentGrid
+from scanfind.parameters import PRESETS
+from scanfind.pose import Pose
+from scanfind.recognise import Recognition
+from scanfind.scene import build_scene, first_cell
+from scanfind.search import Hypotheses
+from scanfind.sources import Sources
+from scanfind.threads import available_cores
+from scanfind.verify import why_refused
+
+# A beam that ends so near to a sample speaks for it; one that goes on so far behind it has passed through it.
+ON_M, THROUGH_M = 0.015, 0.03
+# cosine to the beam below which a surface may return nothing
+LEAST_FACING = 0.25
+
+
+class Weighed(NamedTuple):
+    """What scanfind says of a pose it is led to: its score, support, share seen through, why it refuses it."""
+
+    score: float
+    support: float
+    penalty: float
+    reason: str
+
+    def told(self) -> str:
+        """In words."""
+        words = f"score {self.score:.2f} (support {self.support:.0%}, seen through {self.penalty:.1%})"
+        return f"{words}: {self.reason}" if self.reason else words
+
+
+def weighed(trial: Trial, part: Part, pose: Pose) -> Weighed | None:
+    """The evidence where scanfind's own refinement leads from a pose; None where that already drops it.
+
+    The scene is resampled as `find` does it: for the whole library.
+    """
+    models, parameters, jobs = library_of(trial.sought).models(), PRESETS["default"], available_cores()
+    number = [model.name for model in models].index(part.name)
+    diameters = [model.diameter for model in models]
+    grid = MomentGrid(first_cell(diameters, parameters.grid), jobs=jobs)
+    for chunk in Sources(trial.scanned.stations).chunks():
+        grid.add(chunk)
+    scene = build_scene(grid, min(diameters), parameters.grid, parameters.search.test_cells_across, jobs)
+    search = Recognition(scene, models, joint_table(models), parameters, trial.seed, jobs)
+    offset = pose.translation - scene.fine.cells.offset
+    met = search.refine(Hypotheses(np.array([number]), pose.rotation[None], offset[None], np.ones(1)))
+    candidates = search.candidates(met)
+    if not candidates:
+        return None
+    best = max(candidates, key=lambda candidate: candidate.score)
+    reason = why_refused(best.evidence, not scene.depths, parameters.verify)
+    return Weighed(best.score, best.evidence.support(), best.evidence.penalty(), reason)
+
+
+class Ideal(NamedTuple):
+    """What a scan without noise or gaps would say of a pose: shares of the model's samples.
+
+    on : a surface is where they are; through : beams pass; hidden : behind something, or facing away
+    object_name : what most of those that are on something lie on
+    """
+
+    on: float
+    through: float
+    hidden: float
+    object_name: str
+
+    def told(self) -> str:
+        """In words."""
+        return f"{self.on:.0%} on a surface in sight, {self.through:.1%} seen through, {self.hidden:.0%} hidden"
+
+
+def ideal(trial: Trial, model: Model, pose: Pose) -> Ideal:
+    """Ask the true scene about each sample of a placed model."""
+    points, normals = pose.move(model.samples.points), pose.turn(model.samples.normals)
+    objects, caster = trial.scene.objects, trial.scene.caster()
+    owner = np.full(len(points), -1)
+    passed = np.zeros(len(points), np.bool_)
+    for station in trial.scene.stations:
+        away = points - station
+        length = np.linalg.norm(away, axis=1)
+        beam = away / length[:, None]
+        hits = caster.shoot(station, beam)
+        on = np.abs(hits.distance - length) <= ON_M
+        owner[on] = hits.owner[on]
+        facing = -np.einsum("ij,ij->i", beam, normals) > LEAST_FACING
+        passed |= facing & (hits.distance > length + THROUGH_M)
+    on = owner >= 0
+    counts = np.bincount(owner[on], minlength=len(objects))
+    name = objects[int(counts.argmax())].name if on.any() else "nothing"
+    shown, through = float(on.mean()), float((passed & ~on).mean())
+    return Ideal(shown, through, 1.0 - shown - through, name)
