@@ -22,8 +22,6 @@ NAN = float("nan")
 OFF_M = 0.015
 # A false detection with so much of its surface on an instance is that instance in a wrong pose, or by a wrong name.
 LIKENESS = 0.35
-# So many points on what tells two poses, or two parts, apart are enough: a patch of 70 mm at 10 mm spacing.
-ENOUGH_TELLING = 50
 
 
 class Judged(NamedTuple):
@@ -162,6 +160,3 @@ def false_why(trial: Trial, found: Findings, judged: Judged) -> list[str]:
             f"truly {seen.told()})"
         )
     return told
-
-
-__all__ = ["ENOUGH_TELLING", "Ideal", "Judged", "answer", "matched", "row_of", "telling"]

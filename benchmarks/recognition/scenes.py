@@ -19,8 +19,8 @@ from scanfind.simulate.scenes import PILOT
 
 # Points elsewhere for each on a target: wide, for points are chosen by what the target needs.
 CLUTTER = (2.0, 600.0)
-# On what is seen of a target: one each 29 mm, as the paper's scans had on its spool and frame.
-POINTS_PER_M2, MOST_POINTS = 1200.0, 1_000_000
+# On what is seen of a target: one each 20 mm, as the paper's scans had on its spool.
+POINTS_PER_M2, MOST_POINTS = 2500.0, 1_500_000
 BOARD_M, BOARD_EDGE_M = 0.01, 4.0
 # Where a board stands between a scanner and what it hides, in shares of the way: clear of both.
 BOARD_AT = 0.6

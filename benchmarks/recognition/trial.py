@@ -18,6 +18,8 @@ Key = tuple[str, str, int]
 # A pose is right within 10 mm at the part's middle and half a degree, as in the paper's tables; of a part smaller than
 # two metres its ends may be 10 mm off: half a degree of a 0.5 m flange is 2 mm, the noise.
 RIGHT_MM, RIGHT_DEG = 10.0, 0.5
+# So many points on what tells two poses, or two parts, apart are enough: a patch of 140 mm at 20 mm spacing.
+ENOUGH_TELLING = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,3 +116,7 @@ class Row:
     def key(self) -> Key:
         """What it is about."""
         return (self.line, self.case, self.seed)
+
+    def can_tell(self) -> bool:
+        """Do the data tell the part from its likenesses, or from its twin? True where nobody asks."""
+        return not self.telling < ENOUGH_TELLING
