@@ -137,8 +137,7 @@ def missed_why(trial: Trial, found: Findings, judged: Judged) -> list[str]:
         if own:
             why = f"refused at {own[0].score:.2f}, {own[0].reason}"
         else:
-            ours = weighed(trial, one.part, one.pose)
-            why = "never met, and its own pose is dropped" if ours is None else f"never met, would have {ours.told()}"
+            why = f"not among the refused: {weighed(trial, one.part, one.pose).told()}"
         points = len(trial.points_on(one))
         told.append(f"missed {one.part.name} ({one.visible:.0%} in sight, {points} points): {why}")
     return told

@@ -18,17 +18,24 @@ from scanfind.scene import build_scene, first_cell
 from scanfind.search import Hypotheses
 from scanfind.sources import Sources
 from scanfind.threads import available_cores
-from scanfind.verify import why_refused
+from scanfind.verify import distances, outlines, why_refused
 
 # A beam that ends so near to a sample speaks for it; one that goes on so far behind it has passed through it.
 ON_M, THROUGH_M = 0.015, 0.03
 # cosine to the beam below which a surface may return nothing
 LEAST_FACING = 0.25
+# ICP draws in poses that move no point of a part's outline by more than this share of its diameter.
+DRAWN_IN = 0.1
 
 
 class Weighed(NamedTuple):
-    """What scanfind says of a pose it is led to: its score, support, share seen through, why it refuses it."""
+    """What scanfind would say of the true pose, were it led to it.
 
+    drawn : hypotheses of the first round near enough to be drawn in by ICP
+    score, support, penalty : of the evidence, after refinement; reason : why it refuses it, empty where it does not
+    """
+
+    drawn: int
     score: float
     support: float
     penalty: float
@@ -36,12 +43,13 @@ class Weighed(NamedTuple):
 
     def told(self) -> str:
         """In words."""
-        words = f"score {self.score:.2f} (support {self.support:.0%}, seen through {self.penalty:.1%})"
+        drawn = f"drawn {self.drawn} times in the first round" if self.drawn else "not drawn in the first round"
+        words = f"{drawn}, worth {self.score:.2f} (support {self.support:.0%}, seen through {self.penalty:.1%})"
         return f"{words}: {self.reason}" if self.reason else words
 
 
-def weighed(trial: Trial, part: Part, pose: Pose) -> Weighed | None:
-    """The evidence where scanfind's own refinement leads from a pose; None where that already drops it.
+def weighed(trial: Trial, part: Part, pose: Pose) -> Weighed:
+    """How often the search draws a pose, and the evidence where scanfind's own refinement leads from it.
 
     The scene is resampled as `find` does it: for the whole library.
     """
@@ -54,13 +62,16 @@ def weighed(trial: Trial, part: Part, pose: Pose) -> Weighed | None:
     scene = build_scene(grid, min(diameters), parameters.grid, parameters.search.test_cells_across, jobs)
     search = Recognition(scene, models, joint_table(models), parameters, trial.seed, jobs)
     offset = pose.translation - scene.fine.cells.offset
-    met = search.refine(Hypotheses(np.array([number]), pose.rotation[None], offset[None], np.ones(1)))
-    candidates = search.candidates(met)
+    truth = Hypotheses(np.array([number]), pose.rotation[None], offset[None], np.ones(1))
+    round_ = search.search.round()
+    own = outlines(round_.take(np.flatnonzero(round_.models == number)), search.arrays)
+    drawn = int(np.count_nonzero(distances(outlines(truth, search.arrays)[0], own) < DRAWN_IN * diameters[number]))
+    candidates = search.candidates(search.refine(truth))
     if not candidates:
-        return None
+        return Weighed(drawn, 0.0, 0.0, 0.0, "refinement drops it")
     best = max(candidates, key=lambda candidate: candidate.score)
     reason = why_refused(best.evidence, not scene.depths, parameters.verify)
-    return Weighed(best.score, best.evidence.support(), best.evidence.penalty(), reason)
+    return Weighed(drawn, best.score, best.evidence.support(), best.evidence.penalty(), reason)
 
 
 class Ideal(NamedTuple):
