@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -48,30 +49,35 @@ class Weighed(NamedTuple):
         return f"{words}: {self.reason}" if self.reason else words
 
 
-def weighed(trial: Trial, part: Part, pose: Pose) -> Weighed:
-    """How often the search draws a pose, and the evidence where scanfind's own refinement leads from it.
-
-    The scene is resampled as `find` does it: for the whole library.
-    """
+@lru_cache(maxsize=1)
+def searched(trial: Trial) -> tuple[Recognition, Hypotheses]:
+    """A trial's scene, resampled as `find` does it for the whole library, and the first round of its search."""
     models, parameters, jobs = library_of(trial.sought).models(), PRESETS["default"], available_cores()
-    number = [model.name for model in models].index(part.name)
     diameters = [model.diameter for model in models]
     grid = MomentGrid(first_cell(diameters, parameters.grid), jobs=jobs)
     for chunk in Sources(trial.scanned.stations).chunks():
         grid.add(chunk)
     scene = build_scene(grid, min(diameters), parameters.grid, parameters.search.test_cells_across, jobs)
     search = Recognition(scene, models, joint_table(models), parameters, trial.seed, jobs)
+    return search, search.search.round()
+
+
+def weighed(trial: Trial, part: Part, pose: Pose) -> Weighed:
+    """How often the search draws a pose, and the evidence where scanfind's own refinement leads from it."""
+    search, drawn = searched(trial)
+    scene, verify = search.scene, search.parameters.verify
+    number = [model.name for model in search.models].index(part.name)
     offset = pose.translation - scene.fine.cells.offset
     truth = Hypotheses(np.array([number]), pose.rotation[None], offset[None], np.ones(1))
-    round_ = search.search.round()
-    own = outlines(round_.take(np.flatnonzero(round_.models == number)), search.arrays)
-    drawn = int(np.count_nonzero(distances(outlines(truth, search.arrays)[0], own) < DRAWN_IN * diameters[number]))
+    own = outlines(drawn.take(np.flatnonzero(drawn.models == number)), search.arrays)
+    apart = distances(outlines(truth, search.arrays)[0], own)
+    times = int(np.count_nonzero(apart < DRAWN_IN * search.models[number].diameter))
     candidates = search.candidates(search.refine(truth))
     if not candidates:
-        return Weighed(drawn, 0.0, 0.0, 0.0, "refinement drops it")
+        return Weighed(times, 0.0, 0.0, 0.0, "refinement drops it")
     best = max(candidates, key=lambda candidate: candidate.score)
-    reason = why_refused(best.evidence, not scene.depths, parameters.verify)
-    return Weighed(drawn, best.score, best.evidence.support(), best.evidence.penalty(), reason)
+    reason = why_refused(best.evidence, not scene.depths, verify)
+    return Weighed(times, best.score, best.evidence.support(), best.evidence.penalty(), reason)
 
 
 class Ideal(NamedTuple):
