@@ -13,6 +13,7 @@ from benchmarks.recognition.parts import Part
 from scanfind.pose import Pose, random_rotation
 from scanfind.simulate.parts import blocks
 from scanfind.simulate.placement import surface_points
+from scanfind.simulate.rays import RayCaster
 from scanfind.simulate.scanner import shares
 from scanfind.simulate.scene import Scene, SceneObject
 from scanfind.simulate.scenes import PILOT
@@ -39,8 +40,27 @@ def points_for(scene: Scene) -> int:
     """How many points a scan needs for its targets to have POINTS_PER_M2 on average, at most MOST_POINTS."""
     ids = scene.target_ids()
     share = float(shares(scene.caster(), scene.stations, PILOT)[ids].sum())
-    wanted = sum(POINTS_PER_M2 * scene.objects[k].mesh.area() * scene.visible_share(k) for k in ids)
+    visible = zip(ids, visible_shares(scene, ids), strict=True)
+    wanted = sum(POINTS_PER_M2 * scene.objects[k].mesh.area() * seen for k, seen in visible)
     return round(min(wanted / max(share, 1e-9), MOST_POINTS))
+
+
+def in_sight(scene: Scene, object_id: int, caster: RayCaster) -> NDArray[np.bool_]:
+    """Which points spread over an object (N) each station (S) sees, (S, N)."""
+    points = spread_over(scene, object_id)
+    return np.array([caster.sees(station, points) for station in scene.stations])
+
+
+def spread_over(scene: Scene, object_id: int) -> Floats:
+    """Points (N, 3) spread evenly over an object where it stands."""
+    thing = scene.objects[object_id]
+    return thing.pose.move(surface_points(thing.mesh, np.random.default_rng(object_id)))
+
+
+def visible_shares(scene: Scene, object_ids: Sequence[int]) -> list[float]:
+    """Of each of some objects the share of its surface that the stations together see."""
+    caster = scene.caster()
+    return [float(in_sight(scene, k, caster).any(axis=0).mean()) for k in object_ids]
 
 
 def behind_boards(scene: Scene, occlusion: float, seed: int) -> Scene | None:
@@ -50,9 +70,8 @@ def behind_boards(scene: Scene, occlusion: float, seed: int) -> Scene | None:
     model. Each board's edge lies at an angle of chance; all are pushed by one measure before the target, by bisection.
     """
     (target,) = scene.target_ids()
-    thing, caster = scene.objects[target], scene.caster()
-    points = thing.pose.move(surface_points(thing.mesh, np.random.default_rng(target)))
-    seen = np.array([caster.sees(station, points) for station in scene.stations])
+    thing, points = scene.objects[target], spread_over(scene, target)
+    seen = in_sight(scene, target, scene.caster())
     if 1.0 - seen.any(axis=0).mean() > occlusion:
         return None
     angles = np.random.default_rng([seed, 3]).uniform(0.0, 2 * np.pi, len(scene.stations))

@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.common import Floats, PoseError
 from benchmarks.recognition.parts import Part
+from benchmarks.recognition.scenes import visible_shares
 from scanfind.pose import Pose
 from scanfind.simulate.scanner import SimulatedScan, scan
 from scanfind.simulate.scene import Scene
@@ -72,8 +73,9 @@ class Trial:
     def instances(self) -> list[Instance]:
         """Of the parts sought, those that are there."""
         by_name = {part.name: part for part in self.sought}
-        objects, see = self.scene.objects, self.scene.visible_share
-        return [Instance(by_name[objects[k].name], k, objects[k].pose, see(k)) for k in self.scene.target_ids()]
+        objects, ids = self.scene.objects, self.scene.target_ids()
+        seen = zip(ids, visible_shares(self.scene, ids), strict=True)
+        return [Instance(by_name[objects[k].name], k, objects[k].pose, share) for k, share in seen]
 
     def points_on(self, instance: Instance) -> Floats:
         """(N, 3): the scanned points of an instance, scene frame."""
