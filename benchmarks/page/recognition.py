@@ -62,7 +62,8 @@ HEAD = f"""## Recognition: many parts, likenesses, occlusion
 
 Scenes and definitions of success are in [benchmarks/README.md](../benchmarks/README.md); `python -m
 benchmarks.recognition --line NAME --seeds A-B` makes the rows, each with the reason of what went wrong. Fewer than
-{SCENES} scenes can miss a target but not show that it is held: then there is a dash.
+{SCENES} scenes can miss a target but not show that it is held: then there is a dash. Seconds are wall-clock, with
+whatever else the machine was at.
 """
 
 
@@ -148,7 +149,8 @@ def library(rows: Sequence[Row]) -> Claim:
     ratio = median(ratios)
     found = sum(row.right for row in rows if row.case == "100")
     words = f"{ratio:.1f} × over {len(ratios)} scenes, the spool found in {found}"
-    return Claim("time, a library of 100 against 1 model", "≤ 5 ×", words, ratio <= 5.0)
+    held = ratio <= 5.0 and found == len(ratios)
+    return Claim("time, a library of 100 against 1 model, and the part found", "≤ 5 ×", words, held)
 
 
 def choice(rows: Sequence[Row]) -> Claim:
