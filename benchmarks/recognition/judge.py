@@ -17,7 +17,7 @@ from scanfind.find import find
 from scanfind.near_surface import near_triangles, signed_distances
 from scanfind.parameters import PRESETS
 from scanfind.pose import Pose
-from scanfind.symmetry import cube_turns
+from scanfind.self_similar import cube_turns
 
 NAN = float("nan")
 # The default but for its time limit of 60 s: what is found should not hang on how busy the machine is.

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from scanfind.pose import Pose
 from scanfind.simulate.equipment import FLANGE_OVER_PIPE, TOWARDS_X, flange_thickness, valve
 from scanfind.simulate.objects import Route, SpoolDesign, box_frame, pipe_spool, spool
 from scanfind.simulate.parts import assemble, blocks, revolve
+from scanfind.symmetry import FREE, Axis, Symmetry
 
 # A heavier rating's flange: as much wider and thicker (DN 200: PN 16 has 340 x 24 mm, PN 63 has 415 x 42).
 HEAVIER_RIM, HEAVIER_PLATE = 1.22, 1.75
@@ -25,22 +25,17 @@ TWIN_BRANCH_M, TWIN_RISE_M, TWIN_CROSS_M = 0.12, 0.1, 0.15
 HALF_TURN = np.pi
 
 
-class Symmetry(NamedTuple):
-    """Motions that leave a part as it is, model frame.
-
-    turns : model_from_model, none of them the identity; round_z : any turn about the z axis as well
-    """
-
-    turns: tuple[Pose, ...] = ()
-    round_z: bool = False
-
-
 @dataclass(frozen=True, eq=False)
 class Part:
     """A mesh that is sought, by its name, and its symmetry, which is known because it is built so."""
 
     mesh: Mesh
-    symmetry: Symmetry = field(default_factory=Symmetry)
+    symmetry: Symmetry
+
+    @staticmethod
+    def of(mesh: Mesh, *axes: Axis) -> Part:
+        """A part that is symmetric about the middle of its box."""
+        return Part(mesh, Symmetry(centre_of(mesh.vertices), axes))
 
     @property
     def name(self) -> str:
@@ -51,15 +46,8 @@ class Part:
         return float(np.linalg.norm(np.ptp(self.mesh.vertices, axis=0)))
 
     def error(self, found: Pose, truth: Pose) -> PoseError:
-        """Of a pose, to the nearest of those the part looks the same at; at the middle of its box."""
-        centre = centre_of(self.mesh.vertices)
-        truths = [truth, *(truth @ turn for turn in self.symmetry.turns)]
-        errors = [pose_error(found, one, centre) for one in truths]
-        if self.symmetry.round_z:
-            axes = [float(found.rotation[:, 2] @ one.rotation[:, 2]) for one in truths]
-            tilts = np.degrees(np.arccos(np.clip(axes, -1.0, 1.0))).tolist()
-            errors = [PoseError(error.mm, tilt) for error, tilt in zip(errors, tilts, strict=True)]
-        return min(errors, key=lambda error: (error.deg > 1.0, error.mm))
+        """Of a pose, modulo the symmetry; at the middle of the part's box."""
+        return pose_error(found, truth, self.symmetry)
 
 
 @cache
@@ -170,35 +158,35 @@ def gate_valve(name: str, radius: float, geared: bool = False) -> Part:
     ends = [revolve("end", [(0.0, 0.0), (radius, 0.0)]), revolve("end", [(radius, length), (0.0, length)])]
     box = blocks("box", [((1.6 * radius, 0.0, length / 2 - 0.4 * radius), (2.6 * radius, 1.5 * radius, length / 2))])
     pieces = [body, *ends, *([box] if geared else [])]
-    turn = Pose.from_rotation_vector([HALF_TURN, 0.0, 0.0], [0.0, 0.0, length])
     mesh = assemble(name, [(piece, Pose.identity()) for piece in pieces])
-    return Part(mesh, Symmetry() if geared else Symmetry((turn,)))
+    middle = np.array([0.0, 0.0, length / 2])
+    return Part(mesh, Symmetry(middle, () if geared else (Axis((1.0, 0.0, 0.0), 2),)))
 
 
 def weld_neck(name: str, radius: float, rim: float, plate: float) -> Part:
     """A blind weld-neck flange about z, as round as its facets let it be."""
     neck = 1.2 * radius
     profile = [(0.0, 0.0), (radius, 0.0), (radius, neck), (rim, neck), (rim, neck + plate), (0.0, neck + plate)]
-    return Part(revolve(name, profile), Symmetry(round_z=True))
+    return Part.of(revolve(name, profile), Axis((0.0, 0.0, 1.0), FREE))
 
 
 @cache
 def pipe_spool_part() -> Part:
     """The paper's PS."""
-    return Part(pipe_spool())
+    return Part.of(pipe_spool())
 
 
 @cache
 def box_frame_part() -> Part:
     """The paper's BF."""
-    return Part(box_frame())
+    return Part.of(box_frame())
 
 
 @cache
 def likenesses() -> tuple[Part, ...]:
     """Parts that nearly coincide with themselves when turned: only the brace, a gap or a short rail tells."""
     cage = frame("cage", (1.4, 1.4, 1.4), 0.08, 0.5)
-    return (box_frame_part(), Part(header("header")), Part(cage))
+    return (box_frame_part(), Part.of(header("header")), Part.of(cage))
 
 
 @cache
@@ -208,7 +196,7 @@ def twins(kind: str) -> tuple[Part, Part]:
         made = frame_and_twins("frame", (2.2, 1.4, 1.5), 0.08)
     else:
         made = spool_and_twins("spool", SpoolDesign())
-    return Part(made[""]), Part(made[kind])
+    return Part.of(made[""]), Part.of(made[kind])
 
 
 TWINS = ("branch", "rise", "rating", "mirrored", "cross", "member")
@@ -237,10 +225,10 @@ def hundred() -> tuple[Part, ...]:
     """A library of 100: 8 spools and 5 frames with their twins, 10 valves and 10 flanges of two kinds each."""
     parts: list[Part] = []
     for k in range(8):
-        parts += [Part(mesh) for mesh in spool_and_twins(f"spool_{k}", design_of(k)).values()]
+        parts += [Part.of(mesh) for mesh in spool_and_twins(f"spool_{k}", design_of(k)).values()]
     for k in range(5):
         size = (1.6 + 0.3 * k, 1.2 + 0.1 * k, 1.1 + 0.15 * k)
-        parts += [Part(mesh) for mesh in frame_and_twins(f"frame_{k}", size, (0.06, 0.08)[k % 2]).values()]
+        parts += [Part.of(mesh) for mesh in frame_and_twins(f"frame_{k}", size, (0.06, 0.08)[k % 2]).values()]
     for k in range(10):
         radius = 0.1 + 0.01 * k
         parts += [gate_valve(f"valve_{k}", radius), gate_valve(f"valve_{k}_geared", radius, geared=True)]
@@ -266,4 +254,4 @@ def ten() -> tuple[Part, ...]:
         "frame_0",
         "frame_0_cross",
     )
-    return (*(by_name[name] for name in wanted), Part(header("header")), gate_valve("valve", 0.15, geared=True))
+    return (*(by_name[name] for name in wanted), Part.of(header("header")), gate_valve("valve", 0.15, geared=True))

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from benchmarks.common import Floats, centre_of
 from benchmarks.recognition.parts import Part
 from scanfind.pose import Pose, random_rotation
+from scanfind.rays import RayCaster
 from scanfind.simulate.parts import blocks
 from scanfind.simulate.placement import surface_points
-from scanfind.simulate.rays import RayCaster
 from scanfind.simulate.scanner import shares
 from scanfind.simulate.scene import Scene, SceneObject
 from scanfind.simulate.scenes import PILOT
