@@ -40,7 +40,7 @@ class Judged(NamedTuple):
 def answer(trial: Trial) -> Row:
     """Search a trial's scene, once, and judge what is said."""
     library = library_of(trial.sought)
-    found = find(trial.scanned.stations, library, parameters=PATIENT, seed=trial.seed, isolate=False)
+    found = find(trial.scanned.stations, library, parameters=PATIENT, seed=trial.seed)
     return row_of(trial, found)
 
 
