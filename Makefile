@@ -3,6 +3,7 @@
 # make fast   formats, poses, features, rules and results: half a minute, in an environment that `make test` made
 # make paper  the paper's tables on scanfind, its preset sharif2017 and the rivals installed: hours, goes on where it stopped
 # make paper-quick   one scene a row, a few rows of sharif2017: minutes; its page lies in $(QUICK)
+# make recognition   the lines of recognition, some scenes each: an hour, goes on where it stopped
 # make page   docs/benchmarks.md and its plots from benchmarks/results
 # make clean-kernels   after a change in a kernel that other kernels call: their caches do not notice it
 
@@ -11,6 +12,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 DEMO ?= demo
 SEEDS ?= 5000-5019
+LINE_SEEDS ?= 7400-7411
 QUICK ?= paper-quick
 SOURCES := $(shell find src -name '*.py')
 # An index out of bounds corrupts silently in compiled code: these run once with every access checked.
@@ -21,7 +23,7 @@ KERNEL_TESTS := $(wildcard $(foreach stage,near_surface isolate surface pairs su
 QUICK_TESTS := $(foreach name,pose pairs config results imports deviation verify scans_ply scans_pcd scans_las scans_e57,\
 	tests/test_$(name).py)
 
-.PHONY: demo test checked fast lint paper paper-quick page clean clean-kernels
+.PHONY: demo test checked fast lint paper paper-quick recognition page clean clean-kernels
 
 demo: $(VENV)/installed
 	$(BIN)/scanfind find examples/pump/scan.e57 --model examples/pump/skid.ply --out $(DEMO) --overwrite
@@ -57,6 +59,10 @@ paper-quick: $(VENV)/benched
 	$(BIN)/python -m benchmarks.paper --seeds 0 --system sharif2017 --rows 10,51.295,20.794,0.822,0.917 --out $(QUICK)
 	$(BIN)/python -m benchmarks.page --results $(QUICK) --docs $(QUICK) --pictures 0
 	@echo "paper-quick: the tables lie in $(abspath $(QUICK))/benchmarks.md"
+
+recognition: $(VENV)/benched
+	$(BIN)/python -m benchmarks.recognition --seeds $(LINE_SEEDS)
+	$(BIN)/python -m benchmarks.page
 
 page: $(VENV)/benched
 	$(BIN)/python -m benchmarks.page

@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmarks.common import RESULTS, ROOT, PoseError, centre_of, pose_error, symmetry_of
+from benchmarks.ledger import Ledger, read_rows
 from benchmarks.page import plots
 from benchmarks.page.held import claims
+from benchmarks.page.recognition import read_lines
 from benchmarks.page.results import Results, printed, read
 from benchmarks.page.text import page
 from benchmarks.paper import __main__ as command
@@ -289,10 +291,10 @@ def test_rows_of_another_commit_are_refused_unless_replaced(tmp_path: Path) -> N
 
 
 def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
-    ledger = rows.Ledger(tmp_path / "paper_a.csv")
+    ledger = Ledger(rows.Row, tmp_path / "paper_a.csv")
     for seed in (0, 1, 3):
         ledger.add(rows.judged(small_case("1", seed), "a", exact(small_case("1", seed).cloud)))
-    comments, back = rows.read_rows(ledger.path)
+    comments, back = read_rows(rows.Row, ledger.path)
     assert "seeds: 0-1,3" in comments
     assert [row.key() for row in back] == [row.key() for row in ledger.rows]
     for one, other in zip(back, ledger.rows, strict=True):
@@ -312,7 +314,7 @@ def test_every_experiment_runs_end_to_end(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(experiments, "RUNS_PER_SCENE", 1)
     wanted = {"density": "20", "clutter": "12.191", "completeness": "0.84", "branch": "riser", "effectiveness": "full"}
     command.main(seeds="0", targets="PS", system="scanfind", rows=",".join(wanted.values()), out=tmp_path)
-    _, found = rows.read_rows(tmp_path / "paper_scanfind.csv")
+    _, found = read_rows(rows.Row, tmp_path / "paper_scanfind.csv")
     assert {row.experiment: row.row for row in found} == wanted
     assert all(row.success and row.error_mm < 3.0 and row.rr > 0.9 for row in found)
     assert [row.scene_points for row in found if row.experiment == "density"] == [200_000]
@@ -381,7 +383,7 @@ def test_real_sets_are_cases_with_their_points(shared_data: Path) -> None:
 
 def test_the_page_is_what_the_rows_give(tmp_path: Path) -> None:
     results = read(RESULTS)
-    assert page(results) == (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    assert page(results, read_lines(RESULTS)) == (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
     for drawn in plots.draw(results, tmp_path):
         assert drawn.read_bytes() == (ROOT / "docs" / "pictures" / drawn.name).read_bytes()
 

@@ -1,4 +1,4 @@
-"""Make docs/benchmarks.md and its plots from benchmarks/results/paper_*.csv.
+"""Make docs/benchmarks.md and its plots from benchmarks/results/paper_*.csv and recognition_*.csv.
 
 python -m benchmarks.page
 python -m benchmarks.page --pictures 5000      # also those of found poses, which takes a search each
@@ -14,6 +14,7 @@ import cyclopts
 from benchmarks.common import RESULTS, ROOT
 from benchmarks.page import pictures as photographs
 from benchmarks.page import plots
+from benchmarks.page.recognition import read_lines
 from benchmarks.page.results import read
 from benchmarks.page.text import page
 
@@ -21,7 +22,7 @@ from benchmarks.page.text import page
 def main(results: Path = RESULTS, docs: Path = ROOT / "docs", pictures: int | None = None) -> None:
     """Write the page and its plots.
 
-    :param results: folder of paper_<system>.csv.
+    :param results: folder of paper_<system>.csv and recognition_<line>.csv.
     :param docs: folder for benchmarks.md and pictures/.
     :param pictures: seed of the scene whose pictures are made anew; left out, they stay as they are.
     """
@@ -32,7 +33,7 @@ def main(results: Path = RESULTS, docs: Path = ROOT / "docs", pictures: int | No
     if pictures is not None:
         drawn += photographs.draw(docs / "pictures", pictures)
     path = docs / "benchmarks.md"
-    path.write_text(page(found), encoding="utf-8")
+    path.write_text(page(found, read_lines(results)), encoding="utf-8")
     print(path, *drawn, sep="\n")
 
 

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common import median
+from benchmarks.ledger import read_rows
 from benchmarks.paper.experiments import EXPERIMENTS
-from benchmarks.paper.rows import Row, read_rows
+from benchmarks.paper.rows import Row
 from benchmarks.paper.targets import paper, target
 
 TARGETS = {"PS": "pipe spool", "BF": "box frame"}
@@ -64,7 +65,7 @@ def read(folder: Path) -> Results:
     """All of results/paper_<system>.csv."""
     files = {path.stem.removeprefix("paper_"): path for path in folder.glob("paper_*.csv")}
     names = sorted((name for name in files if not name.startswith("set_")), key=lambda name: (_rank(name), name))
-    tables = {name: read_rows(files[name]) for name in names}
+    tables = {name: read_rows(Row, files[name]) for name in names}
     return Results({name: rows for name, (_, rows) in tables.items()}, {name: c for name, (c, _) in tables.items()})
 
 

@@ -8,7 +8,9 @@ from operator import attrgetter
 
 from benchmarks.common import STAGES
 from benchmarks.page.held import OURS, claims, ratio_of
+from benchmarks.page.recognition import Lines, section
 from benchmarks.page.results import PAPER, TABLES, TARGETS, Printed, Results, middle, printed, success
+from benchmarks.page.tables import number, table
 from benchmarks.paper.experiments import PUBLICATION_SEEDS
 from benchmarks.paper.rows import Row
 from benchmarks.paper.targets import paper
@@ -30,7 +32,7 @@ NOTES = {
 }
 
 
-def page(results: Results) -> str:
+def page(results: Results, lines: Lines) -> str:
     """docs/benchmarks.md."""
     parts = [HEAD, origin(results), held(results)]
     for experiment, numbers in TABLES.items():
@@ -40,7 +42,7 @@ def page(results: Results) -> str:
     parts.append(f"## Each branch removed\n\n{NOTES['branch']}\n")
     parts += [by_system(results, "branch", key) for key in TARGETS]
     parts.append(effectiveness(results))
-    parts.append(PICTURES)
+    parts += [PICTURES, section(lines)]
     return "\n".join(part for part in parts if part)
 
 
@@ -87,7 +89,7 @@ def by_system(results: Results, experiment: str, key: str) -> str:
             cells.append("–" if one is None else "fails" if not one.success else f"found, {one.seconds:g} s")
         for system in systems:
             mine = results.of(system, experiment, key, row)
-            cells.append(f"{success(mine):.2f}, {_number(middle(mine, lambda r: r.total_s), 2)} s" if mine else "–")
+            cells.append(f"{success(mine):.2f}, {number(middle(mine, lambda r: r.total_s), 2)} s" if mine else "–")
         rows.append(cells)
     return f"**{TARGETS[key].capitalize()}**: success rate over all scenes, median time\n\n" + table(
         [experiment, *columns], rows
@@ -117,16 +119,16 @@ def details(rows: Sequence[Row], theirs: Printed | None) -> list[str]:
         f"{middle(rows, lambda r: r.object_points):.0f}",
         f"{success(rows):.2f}",
         f"{sum(row.false for row in rows)}",
-        _number(middle(rows, lambda r: r.rr), 3),
-        _number(theirs.rr if theirs else math.nan, 3),
-        _number(middle(rows, lambda r: r.precision), 3),
-        _number(middle(rows, lambda r: r.rms_cm), 2),
-        _number(theirs.rms_cm if theirs else math.nan, 2),
-        _number(middle(rows, lambda r: r.rms_surface_mm), 2),
-        _number(middle(right, lambda r: r.error_mm), 2),
-        _number(middle(right, lambda r: r.error_deg), 3),
-        *(_number(middle(rows, attrgetter(f"{stage}_s")), 2) for stage in STAGES),
-        _number(middle(rows, lambda r: r.total_s), 2),
+        number(middle(rows, lambda r: r.rr), 3),
+        number(theirs.rr if theirs else math.nan, 3),
+        number(middle(rows, lambda r: r.precision), 3),
+        number(middle(rows, lambda r: r.rms_cm), 2),
+        number(theirs.rms_cm if theirs else math.nan, 2),
+        number(middle(rows, lambda r: r.rms_surface_mm), 2),
+        number(middle(right, lambda r: r.error_mm), 2),
+        number(middle(right, lambda r: r.error_deg), 3),
+        *(number(middle(rows, attrgetter(f"{stage}_s")), 2) for stage in STAGES),
+        number(middle(rows, lambda r: r.total_s), 2),
     ]
 
 
@@ -145,13 +147,3 @@ def effectiveness(results: Results) -> str:
         "which it was isolated at all, with other parameters after a failure.\n\n"
         + table(["", "system", "runs", "success", "effectiveness ratio"], rows)
     )
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
-
-
-def _number(value: float, digits: int) -> str:
-    return "–" if math.isnan(value) else f"{value:.{digits}f}"

@@ -15,9 +15,10 @@ from typing import Annotated
 import cyclopts
 
 from benchmarks.common import RESULTS, median, seeds_of
+from benchmarks.ledger import Ledger
 from benchmarks.paper.definitions import is_right
 from benchmarks.paper.experiments import EXPERIMENTS, Case, Missing, cases
-from benchmarks.paper.rows import Ledger, Row, error_of, judged
+from benchmarks.paper.rows import Row, error_of, judged
 from benchmarks.paper.sets import DATA, set_cases
 from benchmarks.paper.systems import OURS, System, retries, scanfind_with, systems
 from benchmarks.paper.targets import target
@@ -45,7 +46,7 @@ def main(
     """
     chosen, only = systems(system.split(",")), rows.split(",") if rows else []
     stem = f"paper_set_{Path(set_name).resolve().name}" if set_name else "paper"
-    ledgers = {name: Ledger(out / f"{stem}_{name}.csv", date, fresh) for name in chosen}
+    ledgers = {name: Ledger(Row, out / f"{stem}_{name}.csv", date, fresh) for name in chosen}
 
     def missing(experiment: str, key: str, row: str, seed: int, run: int) -> bool:
         if only and row not in only:

@@ -1,14 +1,12 @@
-"""A row of the results: one system's answer to one scene, judged; kept on disk as it comes, so that a run can go on."""
+"""A row of the results: one system's answer to one scene, judged."""
 
 from __future__ import annotations
 
-import csv
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.common import PoseError, origin_lines, pose_error, symmetry_of, write_rows
+from benchmarks.common import PoseError, pose_error, symmetry_of
 from benchmarks.paper.definitions import (
     FARTHEST_M,
     is_right,
@@ -20,7 +18,6 @@ from benchmarks.paper.definitions import (
 )
 from benchmarks.paper.experiments import Case, Key
 from benchmarks.paper.systems import Answer, surface_of
-from scanfind.errors import UsageError
 from scanfind.pose import Pose
 
 NAN = float("nan")
@@ -134,43 +131,3 @@ def why(case: Case, answer: Answer) -> str:
     if any(is_right(error_of(pose, case), case.right_mm) for pose in answer.poses[1:]):
         return "right pose is not the first"
     return "a wrong pose only" if answer.poses else "nothing found"
-
-
-class Ledger:
-    """The rows of one system on disk: each is there as soon as it is added, and a later run goes on from there.
-
-    Raises UsageError where the rows there come from another machine, commit or version, unless `fresh`.
-    """
-
-    def __init__(self, path: Path, date: str = "", fresh: bool = False) -> None:
-        self.path, self.rows = path, list[Row]()
-        self.machine, self.versions, self.commit, _, self.dated = origin_lines("", date)
-        if path.exists() and not fresh:
-            comments, self.rows = read_rows(path)
-            if changed := [line for line in (self.machine, self.versions, self.commit) if line not in comments]:
-                msg = f"{path}: its rows have another origin than {changed[0]!r}; use --fresh to replace them, or --out"
-                raise UsageError(msg)
-        self.keys = {row.key() for row in self.rows}
-
-    def add(self, row: Row) -> None:
-        """Keep a row."""
-        self.rows.append(row)
-        self.keys.add(row.key())
-        seeds = f"seeds: {_ranges({row.seed for row in self.rows})}"
-        write_rows(self.path, self.rows, [self.machine, self.versions, self.commit, seeds, self.dated])
-
-
-def read_rows(path: Path) -> tuple[list[str], list[Row]]:
-    """The comment lines and rows of a results file."""
-    kinds = {field.name: {"str": str, "int": int, "float": float}[str(field.type)] for field in fields(Row)}
-    lines = path.read_text(encoding="utf-8").splitlines()
-    comments = [line[2:] for line in lines if line.startswith("# ")]
-    rows = csv.DictReader(line for line in lines if not line.startswith("# "))
-    return comments, [Row(**{name: kinds[name](value) for name, value in row.items()}) for row in rows]
-
-
-def _ranges(seeds: set[int]) -> str:
-    """`0-4,7` for 0, 1, 2, 3, 4, 7."""
-    starts = sorted(seed for seed in seeds if seed - 1 not in seeds)
-    ends = sorted(seed for seed in seeds if seed + 1 not in seeds)
-    return ",".join(f"{a}-{b}" if b > a else f"{a}" for a, b in zip(starts, ends, strict=True))

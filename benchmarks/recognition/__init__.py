@@ -1,0 +1,1 @@
+"""Recognition people can rely on: false alarms, many instances, occlusion, likenesses, pose, a library, twins."""
