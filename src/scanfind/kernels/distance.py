@@ -65,7 +65,7 @@ class Vicinity(NamedTuple):
     bits: NDArray[np.uint64]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def box_order(centres, leaves):
     """Order (F,) of F centres (F, 3) such that every node of the tree halves its part along the longest side."""
     n = len(centres)
@@ -87,7 +87,7 @@ def box_order(centres, leaves):
     return order
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def split_at(order, values, start, middle, stop):
     """Reorder order[start:stop] so that no value before `middle` is above any from there on (Hoare's selection)."""
     low, high = start, stop - 1
@@ -111,7 +111,7 @@ def split_at(order, values, start, middle, stop):
             return
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def box_tree(corners, leaves):
     """The boxes (2 L, 6) of corners (F, 3, 3) that are in the order of the tree."""
     n = len(corners)
@@ -152,13 +152,13 @@ def corner_of(corners, f, k):
     return corners[f, k, 0], corners[f, k, 1], corners[f, k, 2]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def side(ex, ey, ez, px, py, pz, nx, ny, nz):
     """Negative where p is on the outer side of edge e of a triangle with normal n, both from the edge's beginning."""
     return nx * (ey * pz - ez * py) + ny * (ez * px - ex * pz) + nz * (ex * py - ey * px)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def from_edge(ax, ay, az, bx, by, bz, x, y, z):
     """From the nearest point of edge a → b to the point: dx, dy, dz, and the end it lies on: 1 a, 2 b, 0 between.
 
@@ -178,7 +178,7 @@ def from_edge(ax, ay, az, bx, by, bz, x, y, z):
     return px - t * ex, py - t * ey, pz - t * ez, 0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def to_triangle(corners, normals, f, x, y, z, limit):
     """Squared distance to a triangle, and the part the nearest point lies on; infinite beyond the squared limit.
 
@@ -216,7 +216,7 @@ def to_triangle(corners, normals, f, x, y, z, limit):
     return best, part
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def nearest(near, x, y, z, limit, enough, nodes, bounds):
     """The nearest primitive within `limit`: squared distance, row or -1, part; the lowest face of a tie.
 
@@ -258,7 +258,7 @@ def nearest(near, x, y, z, limit, enough, nodes, bounds):
     return best, row, part
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def signed_distance(near, row, part, squared, x, y, z):
     """Distance of a point to the primitive `nearest` found, + outside; NaN where it is out of reach after all."""
     ax, ay, az = corner_of(near.corners, row, 0)
@@ -285,7 +285,7 @@ def signed_distance(near, row, part, squared, x, y, z):
     return distance if cosine >= 0.0 else -distance
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def to_model(rotation, translation, u, v, w):
     """A point of the shifted scene in the frame of the model placed there by rotation (3, 3) and translation (3,)."""
     u, v, w = u - translation[0], v - translation[1], w - translation[2]
@@ -295,7 +295,7 @@ def to_model(rotation, translation, u, v, w):
     return x, y, z
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def measure(near, rotation, translation, shift, xyz, rows, distance, face):
     """Fill in distance and face of some of the rows, see `distances`."""
     nodes, bounds = np.empty(STACK, np.int64), np.empty(STACK)
@@ -312,7 +312,7 @@ def measure(near, rotation, translation, shift, xyz, rows, distance, face):
                 face[i] = near.face[row]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def distances(near, rotation, translation, shift, xyz, rows):
     """Signed distances (K,) float32 of the points xyz[rows], NaN beyond reach, and the nearest faces (K,), -1 there.
 
@@ -325,7 +325,7 @@ def distances(near, rotation, translation, shift, xyz, rows):
     return distance, face
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def mark_cells(near, rotation, translation, corner, cell, allowed, bits):
     """Set the bits (8,) of the cells within `allowed` of a placed surface, in the block with this low corner (3,)."""
     nodes, bounds = np.empty(STACK, np.int64), np.empty(STACK)
@@ -352,7 +352,7 @@ def mark_cells(near, rotation, translation, corner, cell, allowed, bits):
             m += size * size * size
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def cells_near(near, rotation, translation, low, cell, blocks, tolerance):
     """The cells within `tolerance` of a placed surface as bits (B, 8) of the blocks with coordinates (B, 3)."""
     bits = np.zeros((len(blocks), 8), np.uint64)
@@ -363,7 +363,7 @@ def cells_near(near, rotation, translation, low, cell, blocks, tolerance):
     return bits
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def blocks_of(vicinity, shift, xyz):
     """The block of each of N points whose cell is near a placed surface, (N,) int32; -1 for the many that are not."""
     n = len(xyz)

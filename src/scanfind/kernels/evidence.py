@@ -14,7 +14,7 @@ from scanfind.kernels.placed import placed
 NO_EVIDENCE, SUPPORTED, SEEN_THROUGH, HIDDEN, SILENT = 0, 1, 2, 3, 4
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def gather_evidence(
     start, stop, models, model_starts, model_points, model_normals, most_points, rotations, translations,
     gate, inlier, least_cosine, signed, cell, hash_keys, hash_values, block_rows, first_surfel, sides, means, normals,

@@ -29,7 +29,7 @@ ROWS_A_LOT, BLOCKS_A_LOT = 1 << 12, 1 << 6
 VIEW_BINS = 3  # a view direction is one of 6 cube faces × 3 × 3: two in one bin are less than 35° apart
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def cube_place(x, y, z):
     """Where a direction (any length but 0) meets a cube: its face, and the place on it, each from -1 to 1."""
     ax, ay, az = abs(x), abs(y), abs(z)
@@ -40,7 +40,7 @@ def cube_place(x, y, z):
     return (4 if z > 0 else 5), x / az, y / az
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def pixel_at(face, u, v, edge):
     """The pixel of a cube map of 6 × edge × edge at a place on the cube."""
     iu = min(edge - 1, int((u + 1.0) * 0.5 * edge))
@@ -48,7 +48,7 @@ def pixel_at(face, u, v, edge):
     return (face * edge + iu) * edge + iv
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def pack_beam(face, u, v, edge, distance):
     """The pixel of a beam, and in one int64 how far it went and where within the pixel: of two the nearer is less."""
     along, across = (u + 1.0) * 0.5 * edge, (v + 1.0) * 0.5 * edge
@@ -58,7 +58,7 @@ def pack_beam(face, u, v, edge, distance):
     return (face * edge + iu) * edge + iv, (np.int64(distance * RANGE_UNITS) << 16) | (aim_u << 8) | aim_v
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def unpack_beam(pixel, packed, edge):
     """Unit direction and range of a beam, and the solid angle of its pixel."""
     face, iu, iv = pixel // (edge * edge), pixel // edge % edge, pixel % edge
@@ -71,33 +71,33 @@ def unpack_beam(pixel, packed, edge):
     return x, y, z, (packed >> 16) / RANGE_UNITS, 4.0 / (edge * edge) / length**3
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def cube_pixel(x, y, z, edge):
     """The pixel of a cube map of 6 × edge × edge a direction (any length but 0) falls into."""
     face, u, v = cube_place(x, y, z)
     return pixel_at(face, u, v, edge)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def owner_of(key, shards):
     """The shard a block belongs to: neighbours mostly to different ones, so that each has its share of any surface."""
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     return np.int64((mixed >> np.uint64(52)) % np.uint64(shards))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def place_of(used, lot, shard, shards):
     """Where in an array the `used`-th thing of a shard lies: the shards take lots of it in turn."""
     return ((used // lot) * shards + shard) * lot + used % lot
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def room_for(size, lot, shards):
     """How many things each shard can lay in an array of a size."""
     return size // (lot * shards) * lot
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def row_of_view(block_cells, links, block, local, view):
     """The row of a cell's moments that holds a view, -1 where there is none yet. Few cells have more than three."""
     row = np.int64(block_cells[block, local])
@@ -106,7 +106,7 @@ def row_of_view(block_cells, links, block, local, view):
     return row
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_row(block_cells, links, moments, counts, shard, shards, block, local, view):
     """A new, empty row for a view of a cell, first in the cell's chain; there must be room."""
     row = place_of(counts[1], ROWS_A_LOT, shard, shards)
@@ -117,7 +117,7 @@ def add_row(block_cells, links, moments, counts, shard, shards, block, local, vi
     return row
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_block(hash_keys, hash_values, block_keys, block_cells, counts, shard, shards, key):
     """A new block with no cell in it; there must be room."""
     block = place_of(counts[0], BLOCKS_A_LOT, shard, shards)
@@ -128,7 +128,7 @@ def add_block(hash_keys, hash_values, block_keys, block_cells, counts, shard, sh
     return block
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_child(parents, p, children, c, ex, ey, ez):
     """Add a child's row of moments, about a centre at offset e, to its parent's row."""
     n, sx, sy, sz = children[c, 0], children[c, 1], children[c, 2], children[c, 3]
@@ -146,7 +146,7 @@ def add_child(parents, p, children, c, ex, ey, ez):
         parents[p, k] += children[c, k]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def accumulate(
     points, start, origin, has_origin, offset, cell, shard, shards,
     hash_keys, hash_values, block_keys, block_cells, moments, links, counts, nearest, edge,
@@ -232,7 +232,7 @@ def accumulate(
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def sum_children(
     start, children, child_keys, child_cells, child_moments, child_links, half, shard, shards,
     hash_keys, hash_values, block_keys, block_cells, moments, links, counts,

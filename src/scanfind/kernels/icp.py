@@ -12,7 +12,7 @@ from scanfind.kernels.pair_pose import turn
 from scanfind.kernels.placed import placed
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def solve_damped(hessian, gradient, damping, step):
     """Solve (H + damping · diag) step = gradient for six unknowns by Cholesky; False where H is not positive."""
     lower = np.empty((6, 6))
@@ -42,7 +42,7 @@ def solve_damped(hessian, gradient, damping, step):
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def refine_poses(
     start, stop, models, model_starts, model_points, model_normals, model_centres, model_radii, most_points,
     gates, least_cosine, signed, cell, hash_keys, hash_values, block_rows, first_surfel, sides, means, normals,

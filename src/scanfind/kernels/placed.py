@@ -5,7 +5,7 @@ from __future__ import annotations
 from numba import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def placed(points, normals, i, rotation, translation):
     """Point and normal of sample i of (N, 3), moved by a pose: x, y, z, nx, ny, nz.
 

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 OPPOSED = -0.5
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _bucket(x: int, y: int, z: int, mask: int) -> int:
     # Teschner et al. (2003): three large primes. A collision costs a distance test, nothing else.
     return ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) & mask
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def poisson_order(
     points: NDArray[np.float64], normals: NDArray[np.float64], wanted: int, radius: float, shrink: float, levels: int
 ) -> tuple[NDArray[np.int64], float]:
@@ -83,7 +83,7 @@ def poisson_order(
     return order[:found], radius
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def largest_distance(points: NDArray[np.float64]) -> float:
     """The largest distance between two of N points, by trying them all: 3000 points take 5 ms."""
     largest = 0.0

@@ -10,7 +10,7 @@ from numba import njit
 from scanfind.kernels.blocks import find_block, pack_block, unpack_block
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def smallest_eigenvector(a00, a01, a02, a11, a12, a22):
     """Unit eigenvector of the smallest eigenvalue of a symmetric 3×3 matrix, and the three eigenvalues, ascending.
 
@@ -46,7 +46,7 @@ def smallest_eigenvector(a00, a01, a02, a11, a12, a22):
     return x / n, y / n, z / n, low, 3.0 * mean - low - high, high
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def count_cells(start, stop, order, block_rows, counts):
     """Occupied cells of blocks order[start:stop], into counts (B,); block_rows : (B, 512), -1 for an empty cell."""
     for block in range(start, stop):
@@ -56,7 +56,7 @@ def count_cells(start, stop, order, block_rows, counts):
                 counts[block] += 1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def number_cells(start, stop, order, block_rows, first_cell, cell_locals, cell_rows):
     """Note the place and the row of each cell of blocks order[start:stop], block `k` of them from first_cell[k] on."""
     for block in range(start, stop):
@@ -68,7 +68,7 @@ def number_cells(start, stop, order, block_rows, first_cell, cell_locals, cell_r
                 cell += 1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def sum_views(moments, links, row, views):
     """Sum a cell's rows, from `row` on, into views (1, 13).
 
@@ -81,7 +81,7 @@ def sum_views(moments, links, row, views):
         row = np.int64(links[row, 1])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_moved(pool, table, row, ex, ey, ez):
     """Add a row of moments, about a cell centre at offset e, to the pool about its own centre (offset units)."""
     n, sx, sy, sz = float(table[row, 0]), float(table[row, 1]), float(table[row, 2]), float(table[row, 3])
@@ -97,7 +97,7 @@ def add_moved(pool, table, row, ex, ey, ez):
     pool[9] += table[row, 9] + 2.0 * ez * sz + n * ez * ez
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def plane_of(pool):
     """Normal and eigenvalues of pooled moments."""
     n = pool[0]
@@ -108,7 +108,7 @@ def plane_of(pool):
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def fit_cells(
     start, stop, some, first_cell, cell_locals, cell_rows, order, block_keys, hash_keys, hash_values, block_rows,
     moments, links, cell, units, min_neighbours, n_sides,
