@@ -127,8 +127,8 @@ def score(evidence: Evidence, blind: bool, parameters: VerifyParameters) -> floa
         return min(1.0, evidence.support() / EXPECTED_BLIND)
     on, beside, through, _ = evidence.spoken
     weighed = on + parameters.beside_weight * beside + parameters.penalty_weight * through
-    # Few supported samples can agree by chance: the visible share is believed as far as their number goes. More than half
-    # of a part lies on no floor or wall, whatever its shape tells: where a scan shows the part alone, nothing tells.
+    # Few supported samples can agree by chance: the visible share is believed as far as their number goes. More than
+    # half of a part lies on no floor or wall, whatever its shape tells: where a scan shows it alone, nothing tells.
     believed = evidence.telling + max(0.0, evidence.support() - 0.5)
     return (on / weighed if weighed else 0.0) * float(1.0 - np.exp(-believed / BELIEVED_SUPPORT))
 
