@@ -32,6 +32,7 @@ from scanfind.symmetry import Symmetry, parse_axes
 from test_surface import box, tube
 
 SMALL = ModelParameters(SurfaceParameters(samples=60), PairParameters(angle_cell_deg=30.0))
+ALONE = replace(SMALL, symmetry="none")
 PLACED = Placement("2O2Fr$t4X7Zf8NOew3FLOH", "IfcBeam", "Träger ①", Pose.from_rotation_vector([0.1, 2, 3], [1, 2, 1e6]))
 
 
@@ -508,6 +509,15 @@ def test_the_joint_table_equals_its_naive_twin(several: list[Model]) -> None:
     for key, pairs in cells.items():
         at = slice(table.offsets[key], table.offsets[key + 1])
         assert list(zip(*(column[at].tolist() for column in table[1:]), strict=True)) == pairs
+
+
+def test_pairs_that_a_symmetry_makes_of_others_are_looked_up_once() -> None:
+    bar, crate = build_model(box(1, 0.2, 0.2), SMALL), build_model(box(1, 2, 3, name="crate"), ALONE)
+    assert bar.symmetry.words() == "4-fold about x; 2-fold about y"
+    assert len(joint_table([crate], each_once=True).first) == len(crate.pairs.first)
+    all_of_them, once = joint_table([bar]), joint_table([bar], each_once=True)
+    assert 0.5 < 8 * len(once.first) / len(all_of_them.first) < 2.0
+    assert set(zip(*map(list, once[1:]), strict=True)) <= set(zip(*map(list, all_of_them[1:]), strict=True))
 
 
 def test_models_whose_keys_differ_are_not_joined() -> None:

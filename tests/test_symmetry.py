@@ -75,6 +75,20 @@ def test_the_turns_are_a_group(axes: str) -> None:
         assert all(is_one(one @ other) for other in turns)
 
 
+@given(axes=groups, turned=poses, seed=st.integers(0, 1000))
+@settings(max_examples=50, deadline=None)
+def test_of_places_alike_one_stands_for_all(axes: str, turned: Pose, seed: int) -> None:
+    symmetry = symmetry_of(axes, turned)
+    points = np.random.default_rng(seed).normal(size=(20, 3))
+    alike = np.array([symmetry.stands_for_its_like(motion.move(points)) for motion in symmetry.motions()])
+    np.testing.assert_array_equal(alike.sum(axis=0), 1)
+
+
+def test_on_an_axis_and_in_the_centre_every_place_stands_for_itself() -> None:
+    about_z = Symmetry(np.ones(3), parse_axes("z4"))
+    assert about_z.stands_for_its_like(np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 7.0]])).all()
+
+
 @given(axes=groups, turned=poses, found=poses, truth=poses, seed=st.integers(0, 1000))
 @settings(max_examples=100, deadline=None)
 def test_no_symmetry_changes_an_error(axes: str, turned: Pose, found: Pose, truth: Pose, seed: int) -> None:

@@ -82,7 +82,7 @@ def find(
         sources = Sources(scans, origin)
     with clock("library"):
         library = models_of(models, parameters, units, select)  # 3.2 model library: surface, pairs, hash table
-        table = joint_table(library)
+        table = joint_table(library, each_once=parameters.search.each_once)
 
     with clock("grid"):  # 3.1, 3.3 scene representation: the weighted octree, in one pass
         grid = MomentGrid(first_cell([model.diameter for model in library], parameters.grid), jobs=jobs)

@@ -324,8 +324,10 @@ class JointTable(NamedTuple):
     second: NDArray[np.int32]
 
 
-def joint_table(models: Sequence[Model]) -> JointTable:
+def joint_table(models: Sequence[Model], *, each_once: bool = False) -> JointTable:
     """One hash table for all models, so that a pair of scene points is looked up once (paper 3.4).
+
+    each_once : of pairs that a model's symmetry maps onto one another only one: their hypotheses look the same
 
     Raises LibraryError for no models, or models whose keys do not mean the same.
     """
@@ -335,17 +337,24 @@ def joint_table(models: Sequence[Model]) -> JointTable:
         msg = f"models searched together must share one layout of keys, got {what}; add them with the same parameters"
         raise LibraryError(msg)
     cells = key_count(models[0].parameters.pairs)
+    tables = [pairs_once(m) if each_once else m.pairs for m in models]
     offsets = np.zeros(cells + 1, np.int64)
-    for m in models:
-        offsets[1:] += np.bincount(m.pairs.keys, minlength=cells)
+    for pairs in tables:
+        offsets[1:] += np.bincount(pairs.keys, minlength=cells)
     np.cumsum(offsets, out=offsets)
     table = JointTable(offsets, *(np.empty(offsets[-1], np.int32) for _ in range(3)))
     # Each model's keys are sorted already: a pair goes to its cell's next free place plus its rank within the cell.
     free = offsets[:-1].copy()
-    for number, m in enumerate(models):
-        counts = np.bincount(m.pairs.keys, minlength=cells)
+    for number, pairs in enumerate(tables):
+        counts = np.bincount(pairs.keys, minlength=cells)
         starts = np.cumsum(counts) - counts
-        place = (free - starts)[m.pairs.keys] + np.arange(len(m.pairs.keys))
-        table.model[place], table.first[place], table.second[place] = number, m.pairs.first, m.pairs.second
+        place = (free - starts)[pairs.keys] + np.arange(len(pairs.keys))
+        table.model[place], table.first[place], table.second[place] = number, pairs.first, pairs.second
         free += counts
     return table
+
+
+def pairs_once(model: Model) -> PairTable:
+    """The pairs of a model but for those that its symmetry makes of others: whose first sample stands for its like."""
+    kept = model.symmetry.stands_for_its_like(model.samples.points)[model.pairs.first]
+    return PairTable(*(column[kept] for column in model.pairs))

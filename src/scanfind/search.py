@@ -67,6 +67,8 @@ class SearchParameters:
         model as against in the scene; walls and floors are most of a scan and little of a spool
     telling_first : test pairs first whose feature is rare in this scene: the chance of a pair to be right, over the
         cost of testing it, is one over how often the scene shows its feature
+    each_once : of a model's pairs that its symmetry maps onto one another look up only one: a pipe's pairs are the same
+        all around it, and so are the poses they lead to
     normal_length_m : of the normals in the four-point sets (the paper: 1); 0: its limit, the roll alone from normals
     max_tries : places tried for s2 before another s1 is drawn
     tests : model samples in the sequential test
@@ -84,6 +86,7 @@ class SearchParameters:
     facing_only: bool = True
     by_shape: bool = True
     telling_first: bool = True
+    each_once: bool = True
     normal_length_m: float = 0.0
     max_tries: int = 1000
     tests: int = 192

@@ -31,6 +31,7 @@ OWN_AXIS = np.cos(np.radians(0.5))  # nearer to a coordinate axis than this and 
 # half a radian across the axis of the highest order, and rolls about it by less than half the pitch of LARGEST_ORDER.
 LEANING = rotation_from_vector([0.3, 0.2, 0.35])
 ROLLED = 0.04
+ASKEW = np.array([0.61, 0.43, 0.27])  # along no axis that a part is likely to have, and across none
 ROLLS = 24  # a free axis in steps; half of one moves the end of a diameter by a fifteenth of it
 
 
@@ -127,6 +128,16 @@ class Symmetry:
         axis = np.array(main.direction)
         roll = 0.0 if main.order == FREE else ROLLED
         return LEANING @ turn_about(axis, roll - roll_of(LEANING, axis))
+
+    def stands_for_its_like(self, points: Floats) -> NDArray[np.bool_]:
+        """Of the places that the motions make of one another, is this the one kept? (N,) for points (N, 3), model frame.
+
+        Those nearest to a direction that no motion leaves where it is: a wedge of the model, the whole where there is
+        no symmetry. On its borders, and in the centre, several are.
+        """
+        arms, turns = points - self.centre, np.array([motion.rotation for motion in self.motions()])
+        reach = np.max(arms @ (turns @ ASKEW).T, axis=1)
+        return np.asarray(arms @ ASKEW >= reach - SAME * np.linalg.norm(arms, axis=1))
 
     def moved(self, target_from_model: Pose) -> Symmetry:
         """The symmetry of the model where a pose puts it."""
