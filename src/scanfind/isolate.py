@@ -251,7 +251,8 @@ def vicinity_of(
         kept: list[tuple[NDArray[np.int64], NDArray[np.uint64]]] = []
         for k in range(0, len(blocks), BLOCKS_AT_ONCE):
             some = blocks[k : k + BLOCKS_AT_ONCE]
-            bits = cells_near(p.near, pose.rotation, pose.translation, low, cell, some, parameters.tolerance)
+            bits = np.zeros((len(some), 8), np.uint64)
+            cells_near(p.near, pose.rotation, pose.translation, low, cell, some, parameters.tolerance, bits)
             near = bits.any(axis=1)
             kept.append((np.ravel_multi_index(tuple(some[near].T), tuple(shape)), bits[near]))
         found.append((np.concatenate([a for a, _ in kept]), np.concatenate([b for _, b in kept])))

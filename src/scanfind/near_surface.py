@@ -130,12 +130,14 @@ def in_tree_order(
     signed: bool,
 ) -> NearSurface:
     """The surface of the chosen `faces`, (K,), with its tree of boxes."""
-    from scanfind.kernels.distance import LEAF, NearSurface, box_order, box_tree
+    from scanfind.kernels.distance import LEAF, NearSurface, box_order
 
     leaves = 1
     while leaves * LEAF < len(faces):
         leaves *= 2
-    order = faces[box_order(corners[faces].mean(axis=1), leaves)]
+    order = np.arange(len(faces))
+    box_order(corners[faces].mean(axis=1), leaves, order)
+    order = faces[order]
     chosen = np.ascontiguousarray(corners[order])
     return NearSurface(
         corners=chosen,
@@ -147,6 +149,19 @@ def in_tree_order(
         spacing=spacing,
         signed=bool(signed),
     )
+
+
+def box_tree(corners: Floats, leaves: int) -> Floats:
+    """The boxes (2 leaves, 6) of corners (F, 3, 3) that are in the order of the tree, see NearSurface."""
+    starts = len(corners) * np.arange(leaves) // leaves
+    boxes = np.empty((2 * leaves, 6))
+    boxes[leaves:, :3] = np.minimum.reduceat(corners.min(axis=1), starts)
+    boxes[leaves:, 3:] = np.maximum.reduceat(corners.max(axis=1), starts)
+    while leaves > 1:
+        children, leaves = boxes[leaves : 2 * leaves].reshape(-1, 2, 6), leaves // 2
+        boxes[leaves : 2 * leaves, :3] = children[:, :, :3].min(axis=1)
+        boxes[leaves : 2 * leaves, 3:] = children[:, :, 3:].max(axis=1)
+    return boxes
 
 
 def unit_normals(corners: Floats) -> Floats:

@@ -103,7 +103,8 @@ def build_pairs(samples: OrientedCloud, diameter: float, spacing: float, paramet
     parts = []
     for rung in rungs_of(diameter, parameters):
         shell = rung_distance(rung, parameters), parameters.tolerance * spacing
-        counts = count_pairs(samples.points, *shell)
+        counts = np.empty(len(samples), np.int64)
+        count_pairs(samples.points, *shell, counts)
         ends = np.cumsum(counts)
         keys, first, second = (np.empty(ends[-1], np.int32) for _ in range(3))
         fill_pairs(

@@ -110,7 +110,7 @@ class Surfels:
         fitted = in_threads(
             self._jobs, len(some),
             lambda start, stop: fit_cells(
-                start, stop, some, at.first_cell, at.locals, at.rows, at.order, at.block_keys, at.hash_keys,
+                start, stop, some, at.first_cell.searchsorted(some[start], "right") - 1, at.first_cell, at.locals, at.rows, at.order, at.block_keys, at.hash_keys,
                 at.hash_values, at.block_rows, grid.moments, grid.links, at.cell, grid.units, self._min_neighbours,
                 sides,
             ),

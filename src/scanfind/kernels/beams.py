@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from math import sqrt
 
-from numba import njit
 
 from scanfind.kernels.grid import NO_BEAM, cube_place, unpack_beam
+from scanfind.kernels.jit import kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def pixels_towards(points, origin, reach, edge, nearest, met, pixels):
     """The pixels within `reach` metres of points (N, 3) in which a scanner has a beam; returns how many.
 
@@ -36,7 +36,7 @@ def pixels_towards(points, origin, reach, edge, nearest, met, pixels):
     return count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def beams_of(pixels, nearest, edge, directions, ranges, angles):
     """Unit directions (B, 3), ranges and solid angles (B,) of the beams in some pixels (B,)."""
     for i in range(pixels.shape[0]):

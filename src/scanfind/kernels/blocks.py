@@ -7,32 +7,33 @@ A hash rather than a dense table over the site's bounds: a stray point 5,000 km 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from scanfind.kernels.jit import kernel
 
 BIAS = 1 << 19  # block coordinates are packed as 20 bits an axis: ± 524,288 blocks, ± 84 km with cells of 2 cm
 EMPTY = np.int64(-1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def pack_block(bx, by, bz):
     """One int64, never negative, for a block's coordinates."""
     return ((np.int64(bx) + BIAS) << 40) | ((np.int64(by) + BIAS) << 20) | (np.int64(bz) + BIAS)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def unpack_block(key):
     """The block coordinates `pack_block` was given."""
     return (key >> 40) - BIAS, ((key >> 20) & 0xFFFFF) - BIAS, (key & 0xFFFFF) - BIAS
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def hash_slot(key, mask):
     """Where the search for a key starts (Fibonacci hashing; the high bits are the well-mixed ones)."""
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     return np.int64((mixed >> np.uint64(24)) & np.uint64(mask))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def find_block(keys, values, key):
     """The value stored for a key, -1 where there is none."""
     mask = keys.shape[0] - 1
@@ -46,7 +47,7 @@ def find_block(keys, values, key):
         slot = (slot + 1) & mask
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def insert_block(keys, values, key, value):
     """Store a value for a key that is not there yet; the table must have room."""
     mask = keys.shape[0] - 1
@@ -57,7 +58,7 @@ def insert_block(keys, values, key, value):
     values[slot] = value
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fill_hash(block_keys, blocks, keys, values):
     """Store b for block_keys[b], b in blocks; `keys` must come filled with EMPTY and be at least twice as long."""
     for block in blocks:

@@ -14,10 +14,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from scanfind.kernels.jit import kernel
+
 LEAF = 4  # primitives a leaf at most
 STACK = 64  # a depth-first descent holds at most one open node a level: enough for 2^64 primitives
 SLACK = 1.0 + 1e-9  # for the rounding of two formulas for one squared distance: a tie must be opened, never lost
-TILE = 256  # points that share one stack: its allocation would cost as much as a query
 
 # The parts of a triangle the nearest point may lie on.
 FACE, EDGE, CORNER = 0, 1, 4  # FACE; EDGE + 0, 1, 2: ab, bc, ca; CORNER + 0, 1, 2: a, b, c
@@ -65,11 +66,12 @@ class Vicinity(NamedTuple):
     bits: NDArray[np.uint64]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def box_order(centres, leaves):
-    """Order (F,) of F centres (F, 3) such that every node of the tree halves its part along the longest side."""
+@kernel
+def box_order(centres, leaves, order):
+    """Reorder the numbers `order` (F,) of F centres (F, 3): every node of the tree halves its part along the longest
+    side.
+    """
     n = len(centres)
-    order = np.arange(n)
     level = 1
     while level < leaves:
         for k in range(level):
@@ -84,10 +86,9 @@ def box_order(centres, leaves):
                     axis, longest = candidate, high - low
             split_at(order, centres[:, axis], start, middle, stop)
         level *= 2
-    return order
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def split_at(order, values, start, middle, stop):
     """Reorder order[start:stop] so that no value before `middle` is above any from there on (Hoare's selection)."""
     low, high = start, stop - 1
@@ -111,26 +112,6 @@ def split_at(order, values, start, middle, stop):
             return
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def box_tree(corners, leaves):
-    """The boxes (2 L, 6) of corners (F, 3, 3) that are in the order of the tree."""
-    n = len(corners)
-    boxes = np.empty((2 * leaves, 6))
-    boxes[:, :3], boxes[:, 3:] = np.inf, -np.inf
-    for j in range(leaves):
-        for f in range(n * j // leaves, n * (j + 1) // leaves):
-            for corner in range(3):
-                for k in range(3):
-                    value = corners[f, corner, k]
-                    boxes[leaves + j, k] = min(boxes[leaves + j, k], value)
-                    boxes[leaves + j, 3 + k] = max(boxes[leaves + j, 3 + k], value)
-    for node in range(leaves - 1, 0, -1):
-        for k in range(3):
-            boxes[node, k] = min(boxes[2 * node, k], boxes[2 * node + 1, k])
-            boxes[node, 3 + k] = max(boxes[2 * node, 3 + k], boxes[2 * node + 1, 3 + k])
-    return boxes
-
-
 @njit(inline="always")
 def outside(low, value, high):
     """How far a value is outside an interval."""
@@ -152,13 +133,13 @@ def corner_of(corners, f, k):
     return corners[f, k, 0], corners[f, k, 1], corners[f, k, 2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def side(ex, ey, ez, px, py, pz, nx, ny, nz):
     """Negative where p is on the outer side of edge e of a triangle with normal n, both from the edge's beginning."""
     return nx * (ey * pz - ez * py) + ny * (ez * px - ex * pz) + nz * (ex * py - ey * px)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def from_edge(ax, ay, az, bx, by, bz, x, y, z):
     """From the nearest point of edge a → b to the point: dx, dy, dz, and the end it lies on: 1 a, 2 b, 0 between.
 
@@ -178,7 +159,7 @@ def from_edge(ax, ay, az, bx, by, bz, x, y, z):
     return px - t * ex, py - t * ey, pz - t * ez, 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def to_triangle(corners, normals, f, x, y, z, limit):
     """Squared distance to a triangle, and the part the nearest point lies on; infinite beyond the squared limit.
 
@@ -216,7 +197,7 @@ def to_triangle(corners, normals, f, x, y, z, limit):
     return best, part
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def nearest(near, x, y, z, limit, enough, nodes, bounds):
     """The nearest primitive within `limit`: squared distance, row or -1, part; the lowest face of a tie.
 
@@ -258,7 +239,7 @@ def nearest(near, x, y, z, limit, enough, nodes, bounds):
     return best, row, part
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def signed_distance(near, row, part, squared, x, y, z):
     """Distance of a point to the primitive `nearest` found, + outside; NaN where it is out of reach after all."""
     ax, ay, az = corner_of(near.corners, row, 0)
@@ -285,7 +266,7 @@ def signed_distance(near, row, part, squared, x, y, z):
     return distance if cosine >= 0.0 else -distance
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def to_model(rotation, translation, u, v, w):
     """A point of the shifted scene in the frame of the model placed there by rotation (3, 3) and translation (3,)."""
     u, v, w = u - translation[0], v - translation[1], w - translation[2]
@@ -295,9 +276,13 @@ def to_model(rotation, translation, u, v, w):
     return x, y, z
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def measure(near, rotation, translation, shift, xyz, rows, distance, face):
-    """Fill in distance and face of some of the rows, see `distances`."""
+@kernel
+def distances(near, rotation, translation, shift, xyz, rows):
+    """Signed distances (K,) float32 of the points xyz[rows], NaN beyond reach, and the nearest faces (K,), -1 there.
+
+    rotation, translation : (3, 3), (3,) scene_from_model, where the scene is xyz - shift
+    """
+    distance, face = np.empty(len(rows), np.float32), np.empty(len(rows), np.int32)
     nodes, bounds = np.empty(STACK, np.int64), np.empty(STACK)
     limit = sqrt(near.reach**2 + near.spacing**2)
     for i in range(len(rows)):
@@ -308,27 +293,14 @@ def measure(near, rotation, translation, shift, xyz, rows, distance, face):
         distance[i], face[i] = np.nan, -1
         if row >= 0:
             distance[i] = signed_distance(near, row, part, squared, x, y, z)
-            if not np.isnan(distance[i]):
+            if distance[i] == distance[i]:
                 face[i] = near.face[row]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def distances(near, rotation, translation, shift, xyz, rows):
-    """Signed distances (K,) float32 of the points xyz[rows], NaN beyond reach, and the nearest faces (K,), -1 there.
-
-    rotation, translation : (3, 3), (3,) scene_from_model, where the scene is xyz - shift
-    """
-    distance, face = np.empty(len(rows), np.float32), np.empty(len(rows), np.int32)
-    for tile in range((len(rows) + TILE - 1) // TILE):
-        part = slice(tile * TILE, (tile + 1) * TILE)
-        measure(near, rotation, translation, shift, xyz, rows[part], distance[part], face[part])
     return distance, face
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def mark_cells(near, rotation, translation, corner, cell, allowed, bits):
-    """Set the bits (8,) of the cells within `allowed` of a placed surface, in the block with this low corner (3,)."""
-    nodes, bounds = np.empty(STACK, np.int64), np.empty(STACK)
+@kernel
+def mark_cells(near, rotation, translation, x0, y0, z0, cell, allowed, nodes, bounds, block, bits):
+    """Set the bits bits[block] of the cells within `allowed` of a placed surface, in the block with this low corner."""
     m = 0  # cells in Morton order: a half or quarter of the block that is far from the surface is skipped whole
     while m < 512:
         i = (m & 1) | (m >> 2 & 2) | (m >> 4 & 4)
@@ -337,7 +309,7 @@ def mark_cells(near, rotation, translation, corner, cell, allowed, bits):
         size = 8 if m == 0 else (4 if m % 64 == 0 else (2 if m % 8 == 0 else 1))
         while size > 0:
             half = 0.5 * size * cell
-            u, v, w = corner[0] + i * cell + half, corner[1] + j * cell + half, corner[2] + k * cell + half
+            u, v, w = x0 + i * cell + half, y0 + j * cell + half, z0 + k * cell + half
             x, y, z = to_model(rotation, translation, u, v, w)
             # Half the diagonal, and a millionth more for the rounding of cell addresses.
             limit = allowed + sqrt(3.0) * half * (1.0 + 1e-6)
@@ -346,24 +318,23 @@ def mark_cells(near, rotation, translation, corner, cell, allowed, bits):
                 break
             size //= 2
         if size == 0:
-            bits[i] |= np.uint64(1) << np.uint64(8 * j + k)
+            bits[block, i] |= np.uint64(1) << np.uint64(8 * j + k)
             m += 1
         else:
             m += size * size * size
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def cells_near(near, rotation, translation, low, cell, blocks, tolerance):
-    """The cells within `tolerance` of a placed surface as bits (B, 8) of the blocks with coordinates (B, 3)."""
-    bits = np.zeros((len(blocks), 8), np.uint64)
-    allowed = sqrt(tolerance**2 + near.spacing**2)
+@kernel
+def cells_near(near, rotation, translation, low, cell, blocks, tolerance, bits):
+    """Set the bits (B, 8) of the cells within `tolerance` of a placed surface, in the blocks at coordinates (B, 3)."""
+    nodes, bounds = np.empty(STACK, np.int64), np.empty(STACK)
+    edge, allowed = 8.0 * cell, sqrt(tolerance**2 + near.spacing**2)
     for b in range(len(blocks)):
-        corner = low + 8.0 * cell * blocks[b]
-        mark_cells(near, rotation, translation, corner, cell, allowed, bits[b])
-    return bits
+        x, y, z = low[0] + edge * blocks[b, 0], low[1] + edge * blocks[b, 1], low[2] + edge * blocks[b, 2]
+        mark_cells(near, rotation, translation, x, y, z, cell, allowed, nodes, bounds, b, bits)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def blocks_of(vicinity, shift, xyz):
     """The block of each of N points whose cell is near a placed surface, (N,) int32; -1 for the many that are not."""
     n = len(xyz)

@@ -5,16 +5,16 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numba import njit
 
 from scanfind.kernels.grid import cube_pixel
+from scanfind.kernels.jit import kernel
 from scanfind.kernels.nearest import nearest_surfel
 from scanfind.kernels.placed import placed
 
 NO_EVIDENCE, SUPPORTED, SEEN_THROUGH, HIDDEN, SILENT = 0, 1, 2, 3, 4
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def gather_evidence(
     start, stop, models, model_starts, model_points, model_normals, most_points, rotations, translations,
     gate, inlier, least_cosine, signed, cell, hash_keys, hash_values, block_rows, first_surfel, sides, means, normals,

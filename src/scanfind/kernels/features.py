@@ -5,16 +5,17 @@ from __future__ import annotations
 from math import acos, floor, sqrt
 
 import numpy as np
-from numba import njit
+
+from scanfind.kernels.jit import kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def angle_between(ax, ay, az, bx, by, bz):
     """Angle of two unit vectors, radians, 0 … π."""
     return acos(min(1.0, max(-1.0, ax * bx + ay * by + az * bz)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def feature_key(f1, f2, f3, angle_cell, angle_bins):
     """The cell of the 3D hash table a feature falls into (paper 3.2, Figure 6)."""
     b1 = min(angle_bins - 1, int(floor(f1 / angle_cell)))
@@ -23,12 +24,11 @@ def feature_key(f1, f2, f3, angle_cell, angle_bins):
     return (b1 * angle_bins + b2) * angle_bins + b3
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def count_pairs(points, distance, tolerance):
-    """How many points j lie at distance ± tolerance from each point i, (N,)."""
+@kernel
+def count_pairs(points, distance, tolerance, counts):
+    """Count how many points j lie at distance ± tolerance from each point i, (N,)."""
     n = points.shape[0]
     near, far = (distance - tolerance) ** 2, (distance + tolerance) ** 2
-    counts = np.zeros(n, np.int64)
     for i in range(n):
         found = 0
         for j in range(n):
@@ -37,10 +37,9 @@ def count_pairs(points, distance, tolerance):
             if near <= squared <= far and j != i:
                 found += 1
         counts[i] = found
-    return counts
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fill_pairs(points, normals, distance, tolerance, angle_cell, angle_bins, starts, keys, first, second):
     """Write the key and the two ends of every pair counted by `count_pairs`, point i from starts[i] on."""
     n = points.shape[0]

@@ -12,9 +12,9 @@ from __future__ import annotations
 from math import floor, sqrt
 
 import numpy as np
-from numba import njit
 
 from scanfind.kernels.blocks import BIAS, find_block, insert_block, pack_block, unpack_block
+from scanfind.kernels.jit import kernel
 
 MOMENTS = 13  # n, Σx Σy Σz, Σxx Σxy Σxz Σyy Σyz Σzz, Σ direction to the scanner (3)
 OFFSET_UNITS = 65536.0  # offsets within a cell are counted in 1/65536 of its edge: 0.3 µm in a cell of 2 cm
@@ -29,7 +29,7 @@ ROWS_A_LOT, BLOCKS_A_LOT = 1 << 12, 1 << 6
 VIEW_BINS = 3  # a view direction is one of 6 cube faces × 3 × 3: two in one bin are less than 35° apart
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def cube_place(x, y, z):
     """Where a direction (any length but 0) meets a cube: its face, and the place on it, each from -1 to 1."""
     ax, ay, az = abs(x), abs(y), abs(z)
@@ -40,7 +40,7 @@ def cube_place(x, y, z):
     return (4 if z > 0 else 5), x / az, y / az
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def pixel_at(face, u, v, edge):
     """The pixel of a cube map of 6 × edge × edge at a place on the cube."""
     iu = min(edge - 1, int((u + 1.0) * 0.5 * edge))
@@ -48,7 +48,7 @@ def pixel_at(face, u, v, edge):
     return (face * edge + iu) * edge + iv
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def pack_beam(face, u, v, edge, distance):
     """The pixel of a beam, and in one int64 how far it went and where within the pixel: of two the nearer is less."""
     along, across = (u + 1.0) * 0.5 * edge, (v + 1.0) * 0.5 * edge
@@ -58,7 +58,7 @@ def pack_beam(face, u, v, edge, distance):
     return (face * edge + iu) * edge + iv, (np.int64(distance * RANGE_UNITS) << 16) | (aim_u << 8) | aim_v
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def unpack_beam(pixel, packed, edge):
     """Unit direction and range of a beam, and the solid angle of its pixel."""
     face, iu, iv = pixel // (edge * edge), pixel // edge % edge, pixel % edge
@@ -71,33 +71,33 @@ def unpack_beam(pixel, packed, edge):
     return x, y, z, (packed >> 16) / RANGE_UNITS, 4.0 / (edge * edge) / length**3
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def cube_pixel(x, y, z, edge):
     """The pixel of a cube map of 6 × edge × edge a direction (any length but 0) falls into."""
     face, u, v = cube_place(x, y, z)
     return pixel_at(face, u, v, edge)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def owner_of(key, shards):
     """The shard a block belongs to: neighbours mostly to different ones, so that each has its share of any surface."""
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     return np.int64((mixed >> np.uint64(52)) % np.uint64(shards))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def place_of(used, lot, shard, shards):
     """Where in an array the `used`-th thing of a shard lies: the shards take lots of it in turn."""
     return ((used // lot) * shards + shard) * lot + used % lot
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def room_for(size, lot, shards):
     """How many things each shard can lay in an array of a size."""
     return size // (lot * shards) * lot
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def row_of_view(block_cells, links, block, local, view):
     """The row of a cell's moments that holds a view, -1 where there is none yet. Few cells have more than three."""
     row = np.int64(block_cells[block, local])
@@ -106,29 +106,31 @@ def row_of_view(block_cells, links, block, local, view):
     return row
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def add_row(block_cells, links, moments, counts, shard, shards, block, local, view):
     """A new, empty row for a view of a cell, first in the cell's chain; there must be room."""
-    row = place_of(counts[1], ROWS_A_LOT, shard, shards)
+    row = place_of(counts[1], np.int64(ROWS_A_LOT), shard, shards)
     counts[1] += 1
     links[row, 0], links[row, 1] = view, block_cells[block, local]
     block_cells[block, local] = row
-    moments[row, :] = 0
+    for k in range(moments.shape[1]):
+        moments[row, k] = 0
     return row
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def add_block(hash_keys, hash_values, block_keys, block_cells, counts, shard, shards, key):
     """A new block with no cell in it; there must be room."""
-    block = place_of(counts[0], BLOCKS_A_LOT, shard, shards)
+    block = place_of(counts[0], np.int64(BLOCKS_A_LOT), shard, shards)
     counts[0] += 1
     block_keys[block] = key
-    block_cells[block, :] = -1
+    for k in range(block_cells.shape[1]):
+        block_cells[block, k] = -1
     insert_block(hash_keys, hash_values, key, block)
     return block
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def add_child(parents, p, children, c, ex, ey, ez):
     """Add a child's row of moments, about a centre at offset e, to its parent's row."""
     n, sx, sy, sz = children[c, 0], children[c, 1], children[c, 2], children[c, 3]
@@ -146,7 +148,7 @@ def add_child(parents, p, children, c, ex, ey, ez):
         parents[p, k] += children[c, k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def accumulate(
     points, start, origin, has_origin, offset, cell, shard, shards,
     hash_keys, hash_values, block_keys, block_cells, moments, links, counts, nearest, edge,
@@ -163,8 +165,8 @@ def accumulate(
     """
     inverse = 1.0 / cell
     n = points.shape[0]
-    most_blocks = room_for(block_keys.shape[0], BLOCKS_A_LOT, shards)
-    most_rows = room_for(moments.shape[0], ROWS_A_LOT, shards)
+    most_blocks = room_for(block_keys.shape[0], np.int64(BLOCKS_A_LOT), shards)
+    most_rows = room_for(moments.shape[0], np.int64(ROWS_A_LOT), shards)
     last_key = np.int64(-1)
     last_block = np.int64(-1)
     mine = True
@@ -232,7 +234,7 @@ def accumulate(
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def sum_children(
     start, children, child_keys, child_cells, child_moments, child_links, half, shard, shards,
     hash_keys, hash_values, block_keys, block_cells, moments, links, counts,
@@ -242,8 +244,8 @@ def sum_children(
     children : where the child blocks lie, of which those from `start` on are summed
     half : half a child's edge in offset units: a child's centre lies so far from its parent's, along each axis
     """
-    most_blocks = room_for(block_keys.shape[0], BLOCKS_A_LOT, shards)
-    most_rows = room_for(moments.shape[0], ROWS_A_LOT, shards)
+    most_blocks = room_for(block_keys.shape[0], np.int64(BLOCKS_A_LOT), shards)
+    most_rows = room_for(moments.shape[0], np.int64(ROWS_A_LOT), shards)
     for at in range(start, children.shape[0]):
         child = children[at]
         bx, by, bz = unpack_block(child_keys[child])

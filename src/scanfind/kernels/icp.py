@@ -5,14 +5,14 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numba import njit
 
+from scanfind.kernels.jit import kernel
 from scanfind.kernels.nearest import nearest_surfel
 from scanfind.kernels.pair_pose import turn
 from scanfind.kernels.placed import placed
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def solve_damped(hessian, gradient, damping, step):
     """Solve (H + damping · diag) step = gradient for six unknowns by Cholesky; False where H is not positive."""
     lower = np.empty((6, 6))
@@ -42,7 +42,7 @@ def solve_damped(hessian, gradient, damping, step):
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def refine_poses(
     start, stop, models, model_starts, model_points, model_normals, model_centres, model_radii, most_points,
     gates, least_cosine, signed, cell, hash_keys, hash_values, block_rows, first_surfel, sides, means, normals,
@@ -67,8 +67,10 @@ def refine_poses(
         centre, radius = model_centres[model], model_radii[model]
         for iteration in range(gates.shape[0]):
             gate = gates[iteration]
-            hessian[:, :] = 0.0
-            gradient[:] = 0.0
+            for i in range(6):
+                gradient[i] = 0.0
+                for j in range(6):
+                    hessian[i, j] = 0.0
             weights = squares = 0.0
             count = 0
             ox = rotation[0, 0] * centre[0] + rotation[0, 1] * centre[1] + rotation[0, 2] * centre[2] + translation[0]

@@ -5,12 +5,12 @@ from __future__ import annotations
 from math import floor
 
 import numpy as np
-from numba import njit
 
 from scanfind.kernels.blocks import find_block, pack_block
+from scanfind.kernels.jit import kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def nearest_surfel(
     x, y, z, nx, ny, nz, gate, least_cosine, signed,
     cell, hash_keys, hash_values, block_rows, first_surfel, sides, means, normals,
@@ -50,7 +50,7 @@ def nearest_surfel(
     return best
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def mark_around(points, reach, cell, hash_keys, hash_values, layers):
     """Mark the cells up to `reach` cells, at most 8, from those points (N, 3) lie in.
 
@@ -79,7 +79,7 @@ def mark_around(points, reach, cell, hash_keys, hash_values, layers):
                         layers[block, lx] |= word
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def mark_rows(blocks, layers, block_rows, marked):
     """Mark the rows (bool, in place) of the occupied ones of the cells marked in some blocks."""
     for block in blocks:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from numba import njit
 
+from scanfind.kernels.jit import kernel
 from scanfind.kernels.placed import placed
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def self_overlap(points, normals, signed, some, rotation, translation, reach):
     """Share of the first `some` samples that a motion brings within `reach` metres of a sample with a like normal.
 
@@ -25,7 +25,7 @@ def self_overlap(points, normals, signed, some, rotation, translation, reach):
     return hits / max(some, 1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def count_shifts(points, normals, signed, per_metre, reach, table):
     """Count, in cells of a table (2 a + 1, 2 b + 1, 2 c + 1), the shifts that lead from a sample to one of like normal.
 

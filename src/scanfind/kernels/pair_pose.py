@@ -5,10 +5,11 @@ from __future__ import annotations
 from math import cos, sin, sqrt
 
 import numpy as np
-from numba import njit
+
+from scanfind.kernels.jit import kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def frame_of_pair(p1, n1, p2, n2, frame):
     """Write the rows x, y, z of a pair's own frame: x along the pair, z the normals' mean turning axis; False if open.
 
@@ -37,7 +38,7 @@ def frame_of_pair(p1, n1, p2, n2, frame):
         frame[3, 2 * k + 1] = frame[2, 0] * n[0] + frame[2, 1] * n[1] + frame[2, 2] * n[2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def pose_from_frames(model, scene, rotation):
     """Rotation of a model pair's frame onto a scene pair's: axes along each other, the roll least squares over normals.
 
@@ -61,7 +62,7 @@ def pose_from_frames(model, scene, rotation):
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def refine_four_points(m1, a1, m2, a2, s1, b1, s2, b2, length, rotation):
     """Newton steps from the limit above to the least-squares rotation for normals of a given length, metres."""
     q = 0.25 * length
@@ -100,7 +101,7 @@ def refine_four_points(m1, a1, m2, a2, s1, b1, s2, b2, length, rotation):
         turn(rotation, wx, wy, wz)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def turn(rotation, wx, wy, wz):
     """Turn a rotation (in place) by a small rotation vector, from the left; exact (Rodrigues)."""
     angle = sqrt(wx * wx + wy * wy + wz * wz)
@@ -115,7 +116,7 @@ def turn(rotation, wx, wy, wz):
         rotation[2, j] = c * z + s * (kx * y - ky * x) + dot * kz
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fit_pairs(m1, a1, m2, a2, s1, b1, s2, b2, length, rotations, translations):
     """`scene_from_model` of K matching pairs, all (K, 3); used by tests and by whoever has pairs in hand."""
     model, scene = np.empty((4, 4)), np.empty((4, 4))
@@ -129,7 +130,7 @@ def fit_pairs(m1, a1, m2, a2, s1, b1, s2, b2, length, rotations, translations):
         place_pair(m1[k], a1[k], m2[k], a2[k], s1[k], b1[k], s2[k], b2[k], length, rotations[k], translations[k])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def place_pair(m1, a1, m2, a2, s1, b1, s2, b2, length, rotation, translation):
     """The translation that goes with a rotation: centroid of four points onto centroid of four."""
     q = 0.25 * length

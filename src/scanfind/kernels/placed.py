@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from numba import njit
+from scanfind.kernels.jit import kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+
+@kernel
 def placed(points, normals, i, rotation, translation):
     """Point and normal of sample i of (N, 3), moved by a pose: x, y, z, nx, ny, nz.
 

@@ -5,21 +5,22 @@ from __future__ import annotations
 from math import floor, sqrt
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from scanfind.kernels.jit import kernel
 
 # Two samples whose normals are more than 120° apart lie on two faces of a thin plate: neither stands for the other.
 # The right angle at the edge of a box does not count as two faces, or samples would crowd along every edge.
 OPPOSED = -0.5
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _bucket(x: int, y: int, z: int, mask: int) -> int:
     # Teschner et al. (2003): three large primes. A collision costs a distance test, nothing else.
     return ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) & mask
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def poisson_order(
     points: NDArray[np.float64], normals: NDArray[np.float64], wanted: int, radius: float, shrink: float, levels: int
 ) -> tuple[NDArray[np.int64], float]:
@@ -41,12 +42,15 @@ def poisson_order(
     head = np.empty(size, np.int64)  # bucket → newest sample in it, -1 for none
     older = np.empty(wanted, np.int64)  # sample → the one before it in its bucket
     order = np.empty(wanted, np.int64)
-    chosen = np.zeros(n, np.bool_)
+    chosen = np.empty(n, np.bool_)
+    for c in range(n):
+        chosen[c] = False
     found = 0
     for level in range(levels):
         if level > 0:
             radius *= shrink
-        head[:] = -1
+        for b in range(size):
+            head[b] = -1
         for s in range(found):
             p = points[order[s]]
             b = _bucket(floor(p[0] / radius), floor(p[1] / radius), floor(p[2] / radius), size - 1)
@@ -83,7 +87,7 @@ def poisson_order(
     return order[:found], radius
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def largest_distance(points: NDArray[np.float64]) -> float:
     """The largest distance between two of N points, by trying them all: 3000 points take 5 ms."""
     largest = 0.0

@@ -5,17 +5,17 @@ from __future__ import annotations
 from math import cos, floor, pi, sin, sqrt
 
 import numpy as np
-from numba import njit
 
 from scanfind.kernels.blocks import find_block, insert_block, pack_block, unpack_block
 from scanfind.kernels.features import angle_between, feature_key
 from scanfind.kernels.grid import cube_pixel
+from scanfind.kernels.jit import kernel
 from scanfind.kernels.pair_pose import frame_of_pair, place_pair, pose_from_frames, refine_four_points
 
 NORMAL_BINS = 3  # a normal's bin is one of 6 cube faces × 3 × 3, about 30° wide: 54 bits of a cell's 64-bit mask
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def random_bits(seed, stream, counter):
     """64 random bits of (seed, stream, counter): splitmix64's finaliser over a Weyl sequence.
 
@@ -28,20 +28,20 @@ def random_bits(seed, stream, counter):
     return x ^ (x >> np.uint64(31))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def unit_interval(bits):
     """Uniform in [0, 1) from the upper 53 of 64 bits."""
     return float(bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def draw_firsts(seed, stream, size, firsts):
     """Draw the first end of each of K pairs among `size` places in the pool, evenly."""
     for k in range(firsts.shape[0]):
         firsts[k] = np.int64(unit_interval(random_bits(seed, stream, 2 * k)) * size)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def draw_seconds(
     start, stop, order, firsts, seed, stream, bin_keys, bin_of, hash_keys, hash_values, bin_starts, points, shell,
     distance, tolerance, max_tries, seconds,
@@ -97,7 +97,7 @@ def draw_seconds(
                 break
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def count_partners(some, points, distance, tolerance):
     """How many points (W, 3) lie at distance ± tolerance from some of them, on average."""
     near, far = max(0.0, distance - tolerance) ** 2, (distance + tolerance) ** 2
@@ -111,7 +111,7 @@ def count_partners(some, points, distance, tolerance):
     return total / max(some.shape[0], 1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def key_pairs(first, second, signs, means, normals, angle_cell, angle_bins, keys):
     """The feature cell of each of K scene pairs, -1 for a pair that is none; signs: bit 0 turns n1, bit 1 turns n2."""
     for k in range(first.shape[0]):
@@ -132,13 +132,13 @@ def key_pairs(first, second, signs, means, normals, angle_cell, angle_bins, keys
         keys[k] = feature_key(f1, f2, f3, angle_cell, angle_bins)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def normal_bit(x, y, z):
     """The bit of a direction in an orientation mask."""
-    return np.uint64(1) << np.uint64(cube_pixel(x, y, z, NORMAL_BINS))
+    return np.uint64(1) << np.uint64(cube_pixel(x, y, z, np.int64(NORMAL_BINS)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def mark_orientations(means, normals, reach, cell, spread, signed, hash_keys, hash_values, block_keys, masks, counts):
     """Mark each surfel's normal in the cells it supports: where it is, and up to `reach` along its normal.
 
@@ -186,14 +186,15 @@ def mark_orientations(means, normals, reach, cell, spread, signed, hash_keys, ha
                 block = counts[0]
                 counts[0] += 1
                 block_keys[block] = key
-                masks[block, :] = 0
+                for m in range(512):
+                    masks[block, m] = 0
                 insert_block(hash_keys, hash_values, key, block)
             masks[block, ((cx & 7) << 6) | ((cy & 7) << 3) | (cz & 7)] |= mask
     counts[1] = means.shape[0]
     return means.shape[0]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def lies_on_scene(samples, at, rotation, translation, origins, inverse, hash_keys, hash_values, occupied, masks):
     """Does sample number `at` (point and normal), placed, lie in a cell marked with its normal's direction?
 
@@ -226,14 +227,14 @@ def lies_on_scene(samples, at, rotation, translation, origins, inverse, hash_key
     return 1 if (masks[block, local] & normal_bit(ux, uy, uz)) != np.uint64(0) else 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fetch(points, normals, i, sign, point, normal):
     """Copy an oriented point: a view of a row would count references, which costs two threads more than the copy."""
     for c in range(3):
         point[c], normal[c] = points[i, c], sign * normals[i, c]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def test_pairs(
     start, stop, pair_first, pair_second, pair_signs, pair_keys, means, normals,
     offsets, entry_model, entry_first, entry_second, model_starts, model_points, model_normals, samples,

@@ -5,13 +5,13 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numba import njit
 
 from scanfind.kernels.blocks import find_block, pack_block, unpack_block
+from scanfind.kernels.jit import kernel
 from scanfind.kernels.surfels import smallest_eigenvector
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def bend_of_samples(points, normals, window, bends):
     """Standard deviation across the plane fitted to a model's samples in a cube of edge `window` metres about each of
     the first B of them, (B,), metres.
@@ -46,7 +46,7 @@ def bend_of_samples(points, normals, window, bends):
         bends[i] = sqrt(max(low, 0.0))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def spread_down(levels, block_keys, order, first_cell, cell_locals, hash_keys, hash_values, block_rows, above, found):
     """Give each cell what the cell `levels` above it in the octree has.
 

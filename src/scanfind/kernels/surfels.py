@@ -5,12 +5,12 @@ from __future__ import annotations
 from math import acos, cos, pi, sqrt
 
 import numpy as np
-from numba import njit
 
 from scanfind.kernels.blocks import find_block, pack_block, unpack_block
+from scanfind.kernels.jit import kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def smallest_eigenvector(a00, a01, a02, a11, a12, a22):
     """Unit eigenvector of the smallest eigenvalue of a symmetric 3×3 matrix, and the three eigenvalues, ascending.
 
@@ -46,7 +46,7 @@ def smallest_eigenvector(a00, a01, a02, a11, a12, a22):
     return x / n, y / n, z / n, low, 3.0 * mean - low - high, high
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def count_cells(start, stop, order, block_rows, counts):
     """Occupied cells of blocks order[start:stop], into counts (B,); block_rows : (B, 512), -1 for an empty cell."""
     for block in range(start, stop):
@@ -56,7 +56,7 @@ def count_cells(start, stop, order, block_rows, counts):
                 counts[block] += 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def number_cells(start, stop, order, block_rows, first_cell, cell_locals, cell_rows):
     """Note the place and the row of each cell of blocks order[start:stop], block `k` of them from first_cell[k] on."""
     for block in range(start, stop):
@@ -68,20 +68,21 @@ def number_cells(start, stop, order, block_rows, first_cell, cell_locals, cell_r
                 cell += 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def sum_views(moments, links, row, views):
     """Sum a cell's rows, from `row` on, into views (1, 13).
 
     As integers: the views of a cell are chained in the order the points came in, on which nothing may depend.
     """
-    views[:, :] = 0
+    for k in range(13):
+        views[0, k] = 0
     while row >= 0:
         for k in range(13):
             views[0, k] += moments[row, k]
         row = np.int64(links[row, 1])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def add_moved(pool, table, row, ex, ey, ez):
     """Add a row of moments, about a cell centre at offset e, to the pool about its own centre (offset units)."""
     n, sx, sy, sz = float(table[row, 0]), float(table[row, 1]), float(table[row, 2]), float(table[row, 3])
@@ -97,7 +98,7 @@ def add_moved(pool, table, row, ex, ey, ez):
     pool[9] += table[row, 9] + 2.0 * ez * sz + n * ez * ez
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def plane_of(pool):
     """Normal and eigenvalues of pooled moments."""
     n = pool[0]
@@ -108,13 +109,14 @@ def plane_of(pool):
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fit_cells(
-    start, stop, some, first_cell, cell_locals, cell_rows, order, block_keys, hash_keys, hash_values, block_rows,
+    start, stop, some, rank, first_cell, cell_locals, cell_rows, order, block_keys, hash_keys, hash_values, block_rows,
     moments, links, cell, units, min_neighbours, n_sides,
 ):  # fmt: skip
     """Fit one or two surfels in each of the cells some[start:stop], numbers in ascending order.
 
+    rank : of the block, in the order of cells, that the first of them is in
     first_cell, cell_locals, cell_rows : see Cells; order : the blocks in which cells are numbered
     cell : edge, metres; units : offset units a cell
     min_neighbours : occupied cells of the 3×3×3 a normal needs, the cell itself included
@@ -124,12 +126,11 @@ def fit_cells(
     """
     unit = cell / units
     faces, count = np.empty((2 * (stop - start), 8)), 0
-    pool = np.zeros(10)
-    side = np.zeros(10)
+    pool, side = np.empty(10), np.empty(10)
     around = np.empty(27, np.int64)
     neighbours = np.empty(27, np.int64)
-    views = np.zeros((1, 13), np.int64)
-    rank, last = np.searchsorted(first_cell, some[start], side="right") - 1, np.int64(-1)
+    views = np.empty((1, 13), np.int64)
+    last = np.int64(-1)
     bx = by = bz = np.int64(0)
     for at in range(start, stop):
         c = some[at]
@@ -143,7 +144,8 @@ def fit_cells(
                 around[k] = find_block(hash_keys, hash_values, key)
         local = np.int64(cell_locals[c])
         lx, ly, lz = local >> 6, (local >> 3) & 7, local & 7
-        pool[:] = 0.0
+        for k in range(10):
+            pool[k] = 0.0
         occupied = 0
         for k in range(27):
             ix, iy, iz = lx + k // 9 - 1, ly + k // 3 % 3 - 1, lz + k % 3 - 1
@@ -161,7 +163,7 @@ def fit_cells(
                 add_moved(pool, moments, row, ex, ey, ez)
             else:
                 sum_views(moments, links, row, views)
-                add_moved(pool, views, 0, ex, ey, ez)
+                add_moved(pool, views, np.int64(0), ex, ey, ez)
         nx, ny, nz, low, _, _ = plane_of(pool)
         cx, cy, cz = ((bx << 3) + lx + 0.5) * cell, ((by << 3) + ly + 0.5) * cell, ((bz << 3) + lz + 0.5) * cell
 
@@ -191,12 +193,13 @@ def fit_cells(
             continue
         for s in range(2):
             sign = 1.0 - 2.0 * s
-            side[:] = 0.0
-            pool[:] = 0.0
+            for k in range(10):
+                pool[k] = side[k] = 0.0
             occupied = 0
             dx = dy = dz = np.int64(0)
             for k in range(27):
-                views[:, :] = 0
+                for j in range(13):
+                    views[0, j] = 0
                 row = neighbours[k]
                 while row >= 0:
                     along = moments[row, 10] * nx + moments[row, 11] * ny + moments[row, 12] * nz
@@ -211,10 +214,10 @@ def fit_cells(
                 dy += views[0, 11]
                 dz += views[0, 12]
                 add_moved(
-                    pool, views, 0, (k // 9 - 1) * units, (k // 3 % 3 - 1) * units, (k % 3 - 1) * units
+                    pool, views, np.int64(0), (k // 9 - 1) * units, (k // 3 % 3 - 1) * units, (k % 3 - 1) * units
                 )  # fmt: skip
                 if k == 13:
-                    add_moved(side, views, 0, 0.0, 0.0, 0.0)
+                    add_moved(side, views, np.int64(0), 0.0, 0.0, 0.0)
             mx, my, mz, low = nx, ny, nz, 0.0
             if occupied >= min_neighbours:
                 mx, my, mz, low, _, _ = plane_of(pool)
