@@ -54,11 +54,11 @@ def draw_seconds(
     shell : (Q, 3) from a bin to all those that may hold a point at the distance from one in it
     seconds : (K,) out, a place in the pool; -1 where there is none or max_tries tries met none
 
-    What the bins of a shell hold is counted once for all pairs that begin in a bin; then one in twenty tries is at the
+    What the bins of a shell hold is listed once for all pairs that begin in a bin; then one in twenty tries is at the
     distance. Any direction tried at random met a point in one of two hundred.
     """
     near, far = max(0.0, distance - tolerance) ** 2, (distance + tolerance) ** 2
-    begins, ends = np.empty(shell.shape[0], np.int64), np.empty(shell.shape[0], np.int64)
+    around = np.empty(points.shape[0], np.int32)
     found, last = 0, np.int64(-1)
     for at in range(start, stop):
         k = order[at]
@@ -66,15 +66,15 @@ def draw_seconds(
         if bin_of[one] != last:
             last = bin_of[one]
             cx, cy, cz = unpack_block(bin_keys[last])
-            found, total = 0, np.int64(0)
+            found = 0
             for j in range(shell.shape[0]):
                 there = find_block(
                     hash_keys, hash_values, pack_block(cx + shell[j, 0], cy + shell[j, 1], cz + shell[j, 2])
                 )
                 if there >= 0:
-                    total += bin_starts[there + 1] - bin_starts[there]
-                    begins[found], ends[found] = bin_starts[there + 1] - total, total
-                    found += 1
+                    for place in range(bin_starts[there], bin_starts[there + 1]):
+                        around[found] = place
+                        found += 1
         seconds[k] = -1
         if found == 0:
             continue
@@ -82,15 +82,7 @@ def draw_seconds(
         x, y, z = points[one, 0], points[one, 1], points[one, 2]
         for _ in range(max_tries):
             bits = bits * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-            rank = np.int64(unit_interval(bits) * ends[found - 1])
-            low, high = 0, found - 1
-            while low < high:
-                middle = (low + high) >> 1
-                if ends[middle] > rank:
-                    high = middle
-                else:
-                    low = middle + 1
-            two = begins[low] + rank
+            two = around[np.int64(unit_interval(bits) * found)]
             dx, dy, dz = points[two, 0] - x, points[two, 1] - y, points[two, 2] - z
             if near <= dx * dx + dy * dy + dz * dz <= far:
                 seconds[k] = two
