@@ -119,7 +119,10 @@ class Recognition:
         if limits.miss_probability <= 0.0:
             return self.search.pool_left()
         enough = limits.max_instances is not None and len(self.believed) >= limits.max_instances
-        return not enough and not self.search.may_stop()
+        if enough:
+            return False
+        # With nothing to show, rather a longer search than an answer that the next seed contradicts.
+        return not self.search.may_stop() or (not self.believed and self.search.look_deeper())
 
     def progress(self) -> float:
         """How far the search has come, 0 … 1: the log of the chance to have missed something, as against its limit."""

@@ -46,6 +46,9 @@ BEND_BORDERS = (0.02, 0.05, 0.1)
 # the model's pairs there is near enough: measured 0.5 on spools, 0.05 – 0.4 on frames, far less on sparse ones. Only
 # until an instance is found; then it is counted (Search.learn).
 RIGHT_PAIR_FINDS = 0.006
+# Where nothing at all is found, an instance is looked for that shows only half of λs, the paper's own 0.15, for so many
+# full rounds. Of parts that lost 60 to 70 % of their points every one that was found then was found in the first.
+DEEPER, DEEPER_ROUNDS = 0.5, 2.0
 # A surfel's normal counts as clean below so much of a cell, noise apart; but never fewer than this share of a shape's.
 # Drawing only those doubled the right poses a round finds, on spools and frames.
 CLEAN_CELLS, CLEAN_SHARE = 0.1, 0.3
@@ -202,10 +205,23 @@ class Search:
         self._expected = np.zeros(len(models))
         self._learned = np.zeros((len(models), 2))  # hits, and what was shown, of the instances found
         self._sides = 1 if scene.fine.signed and all(m.signed for m in models) else 4
-        # A right hypothesis puts λs of its samples on the scene, and chance some of the others.
-        wanted = parameters.overlap_ratio
-        right = wanted + (1.0 - wanted) * parameters.chance_overlap
-        self._least_hits = wald_table(parameters.tests, right, parameters.chance_overlap)
+        self._look_for(parameters.overlap_ratio)
+
+    def _look_for(self, overlap_ratio: float) -> None:
+        """Look for instances that show this share of their surface, and more."""
+        self._shown, self._until, chance = overlap_ratio, 0.0, self.parameters.chance_overlap
+        # A right hypothesis puts so many of its samples on the scene, and chance some of the others.
+        right = overlap_ratio + (1.0 - overlap_ratio) * chance
+        self._least_hits = wald_table(self.parameters.tests, right, chance)
+
+    def look_deeper(self) -> bool:
+        """Look for instances that show half of λs for some rounds; False where that is done already."""
+        deeper = DEEPER * self.parameters.overlap_ratio
+        if self._shown <= deeper or not self.pool_left():
+            return False
+        self._look_for(deeper)
+        self._until = self.effort + DEEPER_ROUNDS
+        return True
 
     def withdraw(self, cells: NDArray[np.bool_]) -> None:
         """Draw no more from these cells (V,): they are explained."""
@@ -269,7 +285,9 @@ class Search:
 
     def may_stop(self) -> bool:
         """Is nothing left to draw from, or the chance to have missed an instance of any model below the one allowed?"""
-        return not self.pool_left() or self.chance_missed() < self.parameters.miss_probability
+        if not self.pool_left():
+            return True
+        return self.effort >= self._until if self._until else self.chance_missed() < self.parameters.miss_probability
 
     def pool_left(self) -> bool:
         """Is there a pair left to draw?"""
@@ -283,7 +301,7 @@ class Search:
     def _share(self) -> float:
         """The share of a full round that the next one needs be: as much as is missing."""
         allowed, missed = self.parameters.miss_probability, self.chance_missed()
-        if allowed == 0.0:
+        if allowed == 0.0 or self._until:
             return 1.0
         if self.effort == 0.0:
             return FIRST_ROUND
@@ -294,7 +312,8 @@ class Search:
 
     def learn(self, model: int, hits: int, support: float) -> None:
         """Learn from an instance how often the last round hit it: pairs on it go with the square of what it shows."""
-        self._learned[model] += hits, self._last_share * (support / self.parameters.overlap_ratio) ** 2
+        self._learned[model] += max(hits, 1), self._last_share * (support / self.parameters.overlap_ratio) ** 2
+        self._look_for(self.parameters.overlap_ratio)  # others are looked for as at first
 
     def _rate(self) -> Floats:
         """Hits a full round of an instance of each model that shows λs of its surface, from those found, (models,)."""

@@ -110,9 +110,9 @@ class Surfels:
         fitted = in_threads(
             self._jobs, len(some),
             lambda start, stop: fit_cells(
-                start, stop, some, at.first_cell.searchsorted(some[start], "right") - 1, at.first_cell, at.locals, at.rows, at.order, at.block_keys, at.hash_keys,
-                at.hash_values, at.block_rows, grid.moments, grid.links, at.cell, grid.units, self._min_neighbours,
-                sides,
+                start, stop, some, at.first_cell.searchsorted(some[start], "right") - 1, at.first_cell, at.locals,
+                at.rows, at.order, at.block_keys, at.hash_keys, at.hash_values, at.block_rows, grid.moments, grid.links,
+                at.cell, grid.units, self._min_neighbours, sides,
             ),
         )  # fmt: skip
         self.first_surfel[at.rows[some]] = len(self) + np.cumsum(sides, dtype=np.int64) - sides

@@ -130,7 +130,7 @@ class Symmetry:
         return LEANING @ turn_about(axis, roll - roll_of(LEANING, axis))
 
     def stands_for_its_like(self, points: Floats) -> NDArray[np.bool_]:
-        """Of the places that the motions make of one another, is this the one kept? (N,) for points (N, 3), model frame.
+        """Of places that the motions make of one another, is this the one kept? (N,) for points (N, 3), model frame.
 
         Those nearest to a direction that no motion leaves where it is: a wedge of the model, the whole where there is
         no symmetry. On its borders, and in the centre, several are.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from math import sqrt
 
-
 from scanfind.kernels.grid import NO_BEAM, cube_place, unpack_beam
 from scanfind.kernels.jit import kernel
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from math import acos, floor, sqrt
 
-import numpy as np
-
 from scanfind.kernels.jit import kernel
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 from scanfind.kernels.jit import kernel
 from scanfind.kernels.placed import placed
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from scanfind.kernels.jit import kernel
 
 
-
 @kernel
 def placed(points, normals, i, rotation, translation):
     """Point and normal of sample i of (N, 3), moved by a pose: x, y, z, nx, ny, nz.
