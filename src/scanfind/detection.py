@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.pose import Pose
+
+if TYPE_CHECKING:
+    from scanfind.elements import Element
 
 Floats = NDArray[np.float64]
 
@@ -177,6 +180,8 @@ class Findings(list[Detection]):
     """The detections, best first, with what a report needs around them.
 
     tolerance_m : within which raw points were isolated, metres; None where they were not
+    elements : of the design, what became of each; empty where that was not asked for
+    allowed_m : by how much an element may be off, metres; None: nobody says
     """
 
     refused: list[Refused]
@@ -186,8 +191,11 @@ class Findings(list[Detection]):
     timings_s: dict[str, float]
     notes: list[str]
     tolerance_m: float | None
+    elements: list[Element]
+    allowed_m: float | None
 
     def __init__(self, detections: list[Detection] | None = None) -> None:
         super().__init__(detections or [])
-        self.refused, self.scans, self.notes = [], [], []
+        self.refused, self.scans, self.notes, self.elements = [], [], [], []
         self.shift, self.crs, self.timings_s, self.tolerance_m = (0.0, 0.0, 0.0), None, {}, None
+        self.allowed_m = None

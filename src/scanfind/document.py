@@ -17,6 +17,8 @@ from pydantic_core import to_jsonable_python
 from scanfind import schema
 from scanfind.clock import STAGES
 from scanfind.detection import Detection, Deviation, Findings, Motion, PartFit, Refused, SceneScan
+from scanfind.elements import Element
+from scanfind.mesh import Placement
 from scanfind.pose import Pose
 
 if TYPE_CHECKING:
@@ -67,6 +69,8 @@ def document(
         models=list(models),
         detections=[_detection_entry(found, *files.get(found.id, (None, None))) for found in findings],
         refused=[_refused_entry(refused) for refused in findings.refused],
+        elements=[_element_entry(element, findings.allowed_m) for element in findings.elements],
+        allowed_m=findings.allowed_m,
         remainder=remainder,
         notes=list(findings.notes),
         timings_s=timings,
@@ -78,6 +82,7 @@ def findings_of(results: schema.Results) -> Findings:
     """What `document` was given, made back from what it gave; all but the points."""
     findings = Findings([_detection(entry) for entry in results.detections])
     findings.refused = [_refused(entry) for entry in results.refused]
+    findings.elements, findings.allowed_m = [_element(entry) for entry in results.elements], results.allowed_m
     findings.scans = [SceneScan(scan.path, scan.points, scan.dropped, tuple(scan.stations_m)) for scan in results.scans]
     findings.shift, findings.crs, findings.notes = results.shift_m, results.crs, list(results.notes)
     findings.timings_s, findings.tolerance_m = dict(results.timings_s), results.tolerance_m
@@ -211,6 +216,28 @@ def _refused_entry(refused: Refused) -> schema.RefusedEntry:
     )
 
 
+def _element_entry(element: Element, allowed_m: float | None) -> schema.ElementEntry:
+    placement = element.placement
+    return schema.ElementEntry(
+        global_id=placement.global_id,
+        ifc_class=placement.ifc_class,
+        name=placement.name,
+        model=element.model,
+        status=element.status,
+        verdict=element.verdict(allowed_m),
+        detection=element.detection,
+        design_from_model=_rows(placement.design_from_model),
+        shift_m=element.shift_m,
+        turn_rad=element.turn_rad,
+        off_m=element.off_m,
+        on=element.on,
+        beside=element.beside,
+        through=element.through,
+        hidden=element.hidden,
+        why=element.why,
+    )
+
+
 def _rows(pose: Pose) -> schema.Matrix:
     a, b, c, d = (tuple(row) for row in pose.matrix().tolist())
     return a, b, c, d
@@ -268,6 +295,14 @@ def _part(entry: schema.PartEntry) -> PartFit:
         visible_support=_or_nan(entry.visible_support),
         penalty=_or_nan(entry.penalty),
     )
+
+
+def _element(entry: schema.ElementEntry) -> Element:
+    placement = Placement(entry.global_id, entry.ifc_class, entry.name, _pose(entry.design_from_model))
+    return Element(
+        placement, entry.model, entry.status, entry.detection, entry.shift_m, entry.turn_rad, entry.off_m, entry.on,
+        entry.beside, entry.through, entry.hidden, entry.why,
+    )  # fmt: skip
 
 
 def _refused(entry: schema.RefusedEntry) -> Refused:

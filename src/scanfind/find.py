@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scanfind.assembly import REACH_M
 from scanfind.clock import Clock, say_if_compiling, watched
-from scanfind.cloud import CloudModel, PointChunk, shift_for
+from scanfind.cloud import CloudModel, PointChunk
 from scanfind.detection import Findings
 from scanfind.deviation import deviation_of
 from scanfind.errors import UsageError, require
@@ -27,7 +27,8 @@ from scanfind.parameters import PRESETS, IsolationParameters, Parameters
 from scanfind.polish import polished
 from scanfind.pose import Pose
 from scanfind.recognise import Recognition
-from scanfind.scene import build_scene, first_cell
+from scanfind.scene import build_scene
+from scanfind.sizes import Sizes
 from scanfind.sources import Scan, Sources, require_points
 from scanfind.threads import available_cores
 
@@ -35,7 +36,9 @@ if TYPE_CHECKING:
     from scanfind.detection import Detection
     from scanfind.kernels.distance import NearSurface
     from scanfind.progress import Progress
+    from scanfind.recognise import Standing
     from scanfind.scans import CloudWriter
+    from scanfind.sizes import Size
 
 Floats: TypeAlias = NDArray[np.float64]
 ModelInput: TypeAlias = "ModelLibrary | Mesh | CloudModel | str | PathLike[str]"
@@ -54,6 +57,7 @@ def find(
     progress: Progress | None = None,
     isolate: bool = True,
     remainder: CloudWriter | None = None,
+    at_design: bool = False,
 ) -> Findings:
     """Find every instance of every model in the scans, with no initial guess.
 
@@ -67,6 +71,8 @@ def find(
         progress : called with (stage, done, total), total -1 where nobody knows
         isolate : cut each detection's raw points in a second pass
         remainder : takes every point that belongs to no detection
+        at_design : try where the design puts each model first, and say what became of every element: see
+            `Findings.elements`; the scans are in the design's frame
     Returns the detections, best first; poses in the scans' own frame, metres.
 
     Raises ScanfindError: UsageError, UnreadableFileError, InvalidGeometryError, LibraryError …
@@ -82,26 +88,17 @@ def find(
         sources = Sources(scans, origin)
     with clock("library"):
         library = models_of(models, parameters, units, select)  # 3.2 model library: surface, pairs, hash table
-        table = joint_table(library, each_once=parameters.search.each_once)
 
     with clock("grid"):  # 3.1, 3.3 scene representation: the weighted octree, in one pass
-        grid = MomentGrid(first_cell([model.diameter for model in library], parameters.grid), jobs=jobs)
+        found = Sizes(library, parameters)
+        grid = MomentGrid(found.finest_cell(), jobs=jobs)
         for chunk in watched(sources.chunks(), clock, tell, "read", sources.expected()):
             grid.add(chunk)
         require_points(sources)
-        smallest = min(model.diameter for model in library)
-        scene = build_scene(grid, smallest, parameters.grid, parameters.search.test_cells_across, jobs)
-        del grid
 
-    found = Recognition(scene, library, table, parameters, seed, jobs)
-    while found.wants_more(clock.elapsed("search", "refine", "verify")):
-        tell("search", found.progress(), 1.0)
-        with clock("search"):
-            hypotheses = found.search.round()  # 3.3, 3.4 Algorithm 2: draw, look up, pose, count support
-        with clock("refine"):
-            poses = found.refine(hypotheses)  # 3.4 post-ICP
-        with clock("verify"):
-            found.believe(hypotheses, poses)  # support, penalty, conflicts (Papazov & Burschka 2010)
+    for size in found.groups():  # large models first, each size at its own resolution
+        found.add(recognise(size, grid, found.standing(), parameters, seed, jobs, clock, tell, at_design=at_design))
+    del grid
     tell("search", 1.0, 1.0)
 
     findings.extend(found.detections())
@@ -113,7 +110,7 @@ def find(
     if isolate and (findings or remainder is not None):
         with clock("isolate"):  # 3.5 isolation: the second pass
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
-            tolerance = isolation_tolerance(parameters.isolate, found.noise(), scene.fine.cell)
+            tolerance = isolation_tolerance(parameters.isolate, found.noise(), found.cell())
             findings.tolerance_m = tolerance
             surfaces = surfaces_of(findings, library, tolerance)
             built = {number: as_built(number, faces, tolerance) for number, faces in found.built().items()}
@@ -123,11 +120,44 @@ def find(
             findings[:] = [
                 one if one.parts else polished(one, surfaces[one.model], parameters.refine, jobs) for one in findings
             ]
+    if at_design:
+        with clock("verify"):
+            findings.elements = found.elements(findings)
     findings.scans = [source.told() for source in sources.all]
     findings.crs, findings.notes = sources.crs(), found.notes()
-    findings.shift = tuple(shift_for(scene.fine.cells.offset).tolist())
+    findings.shift = found.shift()
     findings.timings_s = clock.timings()
     return findings
+
+
+def recognise(
+    size: Size, grid: MomentGrid, standing: Sequence[Standing], parameters: Parameters, seed: int, jobs: int,
+    clock: Clock, tell: Progress, *, at_design: bool,
+) -> Recognition:  # fmt: skip
+    """The search for models of one size: what is believed of them, and why (paper 3.3 and 3.4).
+
+    standing : instances of larger models
+    """
+    with clock("grid"):
+        smallest = min(model.diameter for model in size.models)
+        scene = build_scene(grid, smallest, parameters.grid, parameters.search.test_cells_across, jobs)
+    with clock("library"):
+        table = joint_table(size.models, each_once=parameters.search.each_once)
+    found = Recognition(scene, size.models, table, parameters, seed, jobs, standing)
+    for hypotheses in found.at_design() if at_design else ():
+        with clock("refine"):
+            poses = found.refine(hypotheses)
+        with clock("verify"):
+            found.believe(None, poses)
+    while found.wants_more(clock.elapsed("search", "refine", "verify") / size.patience):
+        tell("search", size.progress(found.progress()), 1.0)
+        with clock("search"):
+            hypotheses = found.search.round()  # 3.3, 3.4 Algorithm 2: draw, look up, pose, count support
+        with clock("refine"):
+            poses = found.refine(hypotheses)  # 3.4 post-ICP
+        with clock("verify"):
+            found.believe(hypotheses, poses)  # support, penalty, conflicts (Papazov & Burschka 2010)
+    return found
 
 
 def models_of(

@@ -21,6 +21,8 @@ from scanfind.symmetry import Symmetry, parse_axes
 
 # Part of every model's hash: raise it when the samples or pairs of one and the same model come out differently.
 RECIPE = "scanfind model, recipe 1"
+# Poisson disks jam at 0.56 of the plane, not at the 0.91 of a hexagonal packing: a sample stands for 1.4 spacing².
+AREA_OF_A_SAMPLE = 1.4
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,14 @@ class Model:
     similar: tuple[Similar, ...]
     placements: tuple[Placement, ...]
     parameters: ModelParameters
+
+    def area_of_a_sample(self) -> float:
+        """The surface a sample stands for, m²."""
+        return AREA_OF_A_SAMPLE * self.spacing**2
+
+    def exposed_area(self) -> float:
+        """The surface a scanner could see, m²."""
+        return self.area_of_a_sample() * len(self.samples)
 
 
 class ModelSummary(NamedTuple):

@@ -64,6 +64,7 @@ class MomentGrid:
         self._tables = [empty_hash(EMPTY_BLOCKS // self._shards) for _ in range(self._shards)]
         self._held: list[PointChunk] = []
         self._beams: dict[tuple[float, ...], Ints] = {}
+        self._coarser: MomentGrid | None = None
         self._looking: tuple[tuple[float, ...], Ints] | None = None
 
     @property
@@ -184,10 +185,15 @@ class MomentGrid:
         return self.points / max(int(self.counts[:, 1].sum()), 1)
 
     def coarser(self) -> MomentGrid:
-        """The next level of the octree: cells of twice the edge, each the sum of its eight children."""
+        """The next level of the octree: cells of twice the edge, each the sum of its eight children; summed once."""
+        self.release()
+        if self._coarser is None or self._coarser.points != self.points:
+            self._coarser = self._summed()
+        return self._coarser
+
+    def _summed(self) -> MomentGrid:
         from scanfind.kernels.grid import sum_children
 
-        self.release()
         parent = MomentGrid(2.0 * self.cell, self.offset, self._jobs)
         parent.points, parent.signed = self.points, self.signed
         parent.counts[0, 2] = self.counts[0, 2]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from math import ceil, log
 from typing import TYPE_CHECKING, NamedTuple
@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from scanfind.assembly import Assemblies, Explained, View
 from scanfind.detection import Detection, Motion, Refused
-from scanfind.free_space import Limits, caster_of, spoken_of
+from scanfind.elements import Element, elements_of, placements_of
+from scanfind.free_space import Limits, Spoken, caster_of, spoken_of
+from scanfind.near_surface import signed_distances
 from scanfind.pose import Pose
 from scanfind.refine import Refined, covariance_of, icp, shrinking, triple, unobservable
-from scanfind.search import AREA_OF_A_SAMPLE, Hypotheses, Search, model_arrays
+from scanfind.search import Hypotheses, Search, model_arrays
 from scanfind.verify import (
     Evidence,
     Level,
@@ -30,6 +32,7 @@ from scanfind.verify import (
 )
 
 if TYPE_CHECKING:
+    from scanfind.kernels.distance import NearSurface
     from scanfind.library import JointTable
     from scanfind.model import Model
     from scanfind.parameters import Parameters
@@ -79,12 +82,20 @@ class Candidate(NamedTuple):
     whole: Explained | None = None
 
 
+class Standing(NamedTuple):
+    """An instance found by an earlier search, whose surface is taken: asked for distances up to its reach."""
+
+    surface: NearSurface
+    scene_from_model: Pose
+
+
 class Recognition:
     """The state of one search: what is believed so far, what was refused and why."""
 
     def __init__(
-        self, scene: Scene, models: Sequence[Model], table: JointTable, parameters: Parameters, seed: int, jobs: int
-    ) -> None:
+        self, scene: Scene, models: Sequence[Model], table: JointTable, parameters: Parameters, seed: int, jobs: int,
+        standing: Sequence[Standing] = (),
+    ) -> None:  # fmt: skip
         self.scene, self.models, self.parameters, self.jobs = scene, models, parameters, jobs
         self.arrays = model_arrays(models)
         self.search = Search(scene, models, table, self.arrays, parameters.search, seed, jobs)
@@ -98,7 +109,9 @@ class Recognition:
         self.blind = not scene.depths
         self.believed: list[Candidate] = []
         self._refused: list[tuple[Candidate, str]] = []
+        self._standing = standing
         self._ran_out_of_time = False
+        self._wanted = np.full(len(models), parameters.search.expected or np.iinfo(np.int64).max)
         diameters = np.array([model.diameter for model in models])
         # Poses closer than a thirtieth of the diameter meet in one ICP; after it a hundredth tells them apart.
         self._apart_before, self._apart_after = diameters / 30.0, diameters / 100.0
@@ -123,6 +136,22 @@ class Recognition:
             return False
         # With nothing to show, rather a longer search than an answer that the next seed contradicts.
         return not self.search.may_stop() or (not self.believed and self.search.look_deeper())
+
+    def at_design(self) -> Iterator[Hypotheses]:
+        """The poses the design gives, so many of each model at a time as one refinement takes.
+
+        From here on as many instances of each model are wanted as the design has.
+        """
+        offset, kept = self.scene.fine.cells.offset, self.parameters.search.kept
+        designs = [[each.design_from_model for each in placements_of(model)] for model in self.models]
+        self._wanted = np.array([len(poses) for poses in designs])
+        for start in range(0, int(self._wanted.max()), kept):
+            placed = [
+                self._placements(number, [Pose(each.rotation, each.translation - offset) for each in some])
+                for number, poses in enumerate(designs)
+                if (some := poses[start : start + kept])
+            ]
+            yield joined(placed)
 
     def progress(self) -> float:
         """How far the search has come, 0 … 1: the log of the chance to have missed something, as against its limit."""
@@ -212,24 +241,27 @@ class Recognition:
                 Candidate(
                     number, refined.hypotheses.rotations[k], refined.hypotheses.translations[k], refined.hessians[k],
                     float(refined.rms[k]), seen, score(seen, self.blind, self.parameters.verify),
-                    net * AREA_OF_A_SAMPLE * self.models[number].spacing ** 2,
+                    net * self.models[number].area_of_a_sample(),
                 )
             )  # fmt: skip
         return found
 
     def _evidence(self, hypotheses: Hypotheses) -> list[Evidence]:
         """What surfels and beams say of poses near which the fine surfels are fitted."""
-        verify, level = self.parameters.verify, self._fine
-        limits = Limits(level.inlier, level.margin(verify), verify.least_facing)
+        verify = self.parameters.verify
         support = gather_support(
-            hypotheses, self.scene, level, self._thin, self.arrays, self.signed, verify, self.jobs
+            hypotheses, self.scene, self._fine, self._thin, self.arrays, self.signed, verify, self.jobs
         )  # fmt: skip
         found = []
         for seen, number, rotation, translation in zip(support, *hypotheses[:3], strict=True):
-            model, placed = self.models[number], Pose(rotation, translation)
-            spoken = spoken_of(model, self._caster(number), placed, self.scene.beams, limits)
-            found.append(Evidence(*seen[:-1], spoken, seen.claims))
+            found.append(Evidence(*seen[:-1], self._spoken_of(int(number), Pose(rotation, translation)), seen.claims))
         return found
+
+    def _spoken_of(self, number: int, placed: Pose) -> Spoken:
+        """What beams say of a model at a pose relative to the grid's offset."""
+        verify, level = self.parameters.verify, self._fine
+        limits = Limits(level.inlier, level.margin(verify), verify.least_facing)
+        return spoken_of(self.models[number], self._caster(number), placed, self.scene.beams, limits)
 
     def _caster(self, number: int) -> RayCaster:
         """The surface of a model, made ready for beams when first asked for."""
@@ -237,12 +269,12 @@ class Recognition:
             self._casters[number] = caster_of(self.models[number])
         return self._casters[number]
 
-    def believe(self, hypotheses: Hypotheses, refined: Refined) -> None:
+    def believe(self, hypotheses: Hypotheses | None, refined: Refined) -> None:
         """Accept what the evidence carries; of poses that claim one surface, the one that explains most of it.
 
         Papazov & Burschka's conflict graph, solved greedily by the surface a pose explains.
 
-        hypotheses : of the round, to learn how often an instance is hit
+        hypotheses : of the round, to learn how often an instance is hit; None where they were not drawn
         refined : what became of the best of them, see `refine`
         """
         verify, settled = self.parameters.verify, {id(candidate) for candidate in self.believed}
@@ -258,7 +290,7 @@ class Recognition:
         self._refused += refused
         claimed, believed = self._no_rows(), []
         for candidate in sorted([*self.believed, *fresh], key=lambda c: -c.area):
-            if self._shares(candidate, claimed):
+            if self._shares(candidate, claimed) or self._stands_elsewhere(candidate):
                 self._refused.append((candidate, "another pose explains more of the same surface"))
                 continue
             best = candidate
@@ -266,11 +298,14 @@ class Recognition:
                 best = self._best_of_similar(candidate)
                 if best is not candidate and self._shares(best, claimed):
                     continue  # turned over, it is one we have
-                self.search.learn(best.model, self._hits(hypotheses, best), best.evidence.support())
+                if hypotheses is not None:
+                    self.search.learn(best.model, self._hits(hypotheses, best), best.evidence.support())
             believed.append(best)
             self._claim(best, claimed)
         self.believed = self._shown_alike(believed) if self.blind else believed
         self._refused = closest(self._refused)
+        found = np.bincount([c.model for c in self.believed], minlength=len(self.models))
+        self.search.served(found >= self._wanted)
         self.search.withdraw(claimed[self.scene.fine.cells.rows])
 
     def _explained_by_parts(self, refused: Sequence[Candidate], believed: Sequence[Candidate]) -> list[Candidate]:
@@ -297,7 +332,7 @@ class Recognition:
             if whole is None or whole.reason:
                 continue
             net = whole.evidence.telling - NET_PENALTY * whole.evidence.penalty()
-            area = net * len(self.models[model].samples) * AREA_OF_A_SAMPLE * self.models[model].spacing ** 2
+            area = net * self.models[model].exposed_area()
             found.append(
                 candidate._replace(
                     rotation=whole.pose.rotation, translation=whole.pose.translation, evidence=whole.evidence,
@@ -362,6 +397,15 @@ class Recognition:
         claims = self.scene.fine.cells.rows[self.scene.fine.cell_of[candidate.evidence.claims]]
         return bool(claimed[claims].mean() > self.parameters.verify.shared) if len(claims) else True
 
+    def _stands_elsewhere(self, candidate: Candidate) -> bool:
+        """Does too much of what supports a pose belong to an instance of a larger model?"""
+        points = self.scene.fine.means[candidate.evidence.claims] + self.scene.fine.cells.offset
+        return any(
+            float(np.isfinite(signed_distances(one.surface, one.scene_from_model.inverse().move(points))[0]).mean())
+            > self.parameters.verify.shared
+            for one in self._standing
+        )
+
     def _similar(self, model: int) -> list[Pose]:
         """The motions after which a model could be taken for itself. True symmetries are not tried: nothing tells."""
         return [each.motion for each in self.models[model].similar[: self.parameters.verify.alternatives]]
@@ -381,14 +425,8 @@ class Recognition:
         sound = [c for c in self.candidates(refined) if not why_refused(c.evidence, self.blind, self.parameters.verify)]
         return max([candidate, *sound], key=lambda c: c.area)
 
-    def detections(self) -> list[Detection]:
-        """What is believed, best first, numbered from 1, in the scans' own frame."""
-        ranked = sorted(self.believed, key=lambda c: (-round(c.score, 3), -c.area))[
-            : self.parameters.search.max_instances
-        ]
-        return [self._detection(number, candidate) for number, candidate in enumerate(ranked, start=1)]
-
-    def _detection(self, number: int, found: Candidate) -> Detection:
+    def detection(self, number: int, found: Candidate) -> Detection:
+        """What is told of something believed, under a number, in the scans' own frame."""
         whole = found.whole
         if self.parameters.assembly.parts and whole is None:
             whole = self._assemblies.explain(found.model, Pose(found.rotation, found.translation), believed=True)
@@ -396,7 +434,7 @@ class Recognition:
             self._in_parts[number] = found.model, whole
             found = found._replace(rotation=whole.pose.rotation, translation=whole.pose.translation)
         # Of poses that look the same the one whose parts are told: turned over, each would have another's name.
-        pose = self._as_found(found) if whole else self._pose(found)
+        pose = self.pose_of(found) if whole else self._pose(found)
         seen, radius = found.evidence, float(self.arrays.radii[found.model])
         pivot = pose.move(self.arrays.centres[found.model][None])[0]
         below = self.parameters.refine.unobservable_below
@@ -408,6 +446,19 @@ class Recognition:
             pivot=triple(pivot),
             parts=whole.parts if whole else (),
         )  # fmt: skip
+
+    def elements(self, number: int, detections: Sequence[Detection]) -> list[Element]:
+        """What became of each element of the design that is of a model; detections : as they are reported."""
+        offset = self.scene.fine.cells.offset
+
+        def spoken_at(design: Pose) -> Spoken | None:
+            return None if self.blind else self._spoken_of(number, Pose(design.rotation, design.translation - offset))
+
+        return elements_of(self.models[number], detections, spoken_at)
+
+    def reach(self) -> float:
+        """How far from its surface points of an instance may lie, metres."""
+        return self._fine.inlier
 
     def built(self) -> dict[int, Floats]:
         """By detection, where it was fitted in parts: its faces (F, 3, 3) as built, scan frame, metres."""
@@ -427,10 +478,10 @@ class Recognition:
 
     def _pose(self, found: Candidate) -> Pose:
         """In the scans' own frame; of the poses that look the same always one, however it was come by."""
-        return self.models[found.model].symmetry.canonical(self._as_found(found))
+        return self.models[found.model].symmetry.canonical(self.pose_of(found))
 
-    def _as_found(self, found: Candidate) -> Pose:
-        """In the scans' own frame."""
+    def pose_of(self, found: Candidate) -> Pose:
+        """In the scans' own frame, as it was come by."""
         return Pose(found.rotation, found.translation + self.scene.fine.cells.offset)
 
     def _unobservable(self, found: Candidate) -> tuple[Motion, ...]:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 RESULTS_JSON = "results.json"
 RESULTS_CSV = "results.csv"
+ELEMENTS_CSV = "elements.csv"
 MODELS = "models.scanfind"
 
 NAME_BYTES = 120  # of a model's name in a file name; file systems stop at 255
@@ -147,6 +148,8 @@ def fill_folder(
         remainder=remainder,
     )  # fmt: skip
     _write_csv(folder / RESULTS_CSV, results)
+    if results.elements:
+        _write_elements(folder / ELEMENTS_CSV, results)
     took = time.perf_counter() - began
     timings = results.timings_s | {"write": took, "total": results.timings_s["total"] + took}
     results = results.model_copy(update={"timings_s": timings})
@@ -262,6 +265,26 @@ def _write_csv(path: Path, results: schema.Results) -> None:
             )
 
 
+ELEMENT_COLUMNS = (
+    "global_id", "ifc_class", "name", "model", "status", "verdict", "detection", "shift_x_m", "shift_y_m", "shift_z_m",
+    "turn_deg", "off_m", "on", "beside", "through", "hidden", "why",
+)  # fmt: skip
+
+
+def _write_elements(path: Path, results: schema.Results) -> None:
+    """One line an element of the design, for spreadsheets."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        out = csv.writer(file)
+        out.writerow(ELEMENT_COLUMNS)
+        for each in results.elements:
+            turn_deg = None if each.turn_rad is None else degrees(each.turn_rad)
+            out.writerow([
+                each.global_id, each.ifc_class, each.name, each.model, each.status, each.verdict, each.detection,
+                *(each.shift_m or (None, None, None)), turn_deg, each.off_m, each.on, each.beside, each.through,
+                each.hidden, each.why,
+            ])  # fmt: skip
+
+
 def _files_under(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
 
@@ -269,7 +292,8 @@ def _files_under(folder: Path) -> set[str]:
 def _files_of(results: schema.Results) -> set[str]:
     """What a result folder with this results.json holds."""
     parts = [name for found in results.detections for name in (found.pose, found.isolated)]
-    return {RESULTS_JSON, RESULTS_CSV, MODELS, *(name for name in [*parts, results.remainder] if name)}
+    elements = [ELEMENTS_CSV] if results.elements else []
+    return {RESULTS_JSON, RESULTS_CSV, MODELS, *elements, *(name for name in [*parts, results.remainder] if name)}
 
 
 def _swap(staged: Path, target: Path) -> None:

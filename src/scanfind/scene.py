@@ -112,12 +112,14 @@ def build_scene(
 ) -> Scene:
     """Resample a filled grid (paper 3.1), doubling its cells until the scan fills them.
 
-    grid : the raw points, in cells of `first_cell`; it is left as it is
+    grid : the raw points, in cells of `first_cell` or smaller ones; it is left as it is
     diameter : of the smallest model sought, metres
     test_cells_across : cells of the sequential test along that diameter; a surfel tolerates a sample that is half of
         one off along its normal
     """
     largest_cell = diameter / parameters.least_cells_across
+    while 2.0 * grid.cell <= first_cell([diameter], parameters) * (1.0 + 1e-9):
+        grid = grid.coarser()
     fine = Surfels(grid, parameters.min_neighbours, jobs)
     while parameters.cell_m is None and 2.0 * grid.cell <= largest_cell and not filled(grid, fine, parameters):
         grid = grid.coarser()
@@ -156,6 +158,9 @@ def noise_of(surfels: Surfels, of: NDArray[np.intp]) -> float:
     The median: edges and bends spread the upper half, and quantised ranges (a Kinect's) lie in one plane in much of the
     lower.
     """
+    # Of too few points there is no plane that they do not all lie in.
+    with_normal = of[surfels.has_normal()[of]]
+    of = with_normal if len(with_normal) else of
     return float(np.median(surfels.flatness[of])) if len(of) else 0.0
 
 

@@ -175,10 +175,40 @@ class RefusedEntry(Entry):
     reason: str
 
 
+class ElementEntry(Entry):
+    """An element of the design: what became of it, and the evidence that decided it.
+
+    `status`: installed, uncertain, occluded, not_found, not_enough_data or no_data. `verdict`: in_tolerance or
+    out_of_tolerance, null where it was not found or no `allowed_m` was given. `detection`: the id of the instance taken
+    for it. `shift_m` of its middle, in the scan's axes, `turn_rad` by what angle it is turned, `off_m` how far the
+    point of its surface that moved the most did; all null where it was not found. `on`, `beside`, `through`, `hidden`:
+    what beams say at the design's place, as shares of the surface they went to: they ended on it, near it but not on
+    it, behind it, before it; null where no scanner position is known.
+    """
+
+    global_id: str
+    ifc_class: str
+    name: str
+    model: str
+    status: str
+    verdict: str | None
+    detection: int | None
+    design_from_model: Matrix
+    shift_m: Vector | None
+    turn_rad: float | None
+    off_m: float | None
+    on: float | None
+    beside: float | None
+    through: float | None
+    hidden: float | None
+    why: str
+
+
 class Results(Entry):
     """results.json. `shift_m` was taken off while computing; every coordinate here has it added back.
 
-    `tolerance_m` is within which points were isolated, null where they were not.
+    `tolerance_m` is within which points were isolated, null where they were not. `elements` are those of the design,
+    where a search was asked what became of it; `allowed_m` by how much they may be off.
     """
 
     schema_: int = Field(SCHEMA, alias="schema")
@@ -192,6 +222,8 @@ class Results(Entry):
     models: list[ModelEntry]
     detections: list[DetectionEntry]
     refused: list[RefusedEntry]
+    elements: list[ElementEntry] = []
+    allowed_m: float | None = None
     remainder: str | None = None
     notes: list[str] = []
     timings_s: dict[str, float]

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-# Poisson disks jam at 0.56 of the plane, not at the 0.91 of a hexagonal packing: a sample stands for 1.4 spacing².
-AREA_OF_A_SAMPLE = 1.4
 # What was found first was easier to find than what was not: its rate is halved before it is asked of others.
 LEARNT = 0.5
 # Cells drawn from: fewer make pairs that repeat each other, more cost more to fit than they add to a round's pairs.
@@ -65,6 +63,7 @@ class SearchParameters:
     miss_probability : stop when an instance that shows `overlap_ratio` of its surface has been missed with less than
         this chance; 0: use all of the time limit, as the paper does
     max_instances : stop after so many detections; None: all there are
+    expected : instances of each model: one found so many times is looked for no further; None: nobody knows
     pairs_a_round, hypotheses_a_round : scene pairs drawn before any is tested; hypotheses tested before any is refined
     by_shape : draw points by the likelihood ratio of their local shape: how bent the surface around them is, on the
         model as against in the scene; walls and floors are most of a scan and little of a spool
@@ -84,6 +83,7 @@ class SearchParameters:
     time_limit_s: float | None = 60.0
     miss_probability: float = 0.01
     max_instances: int | None = None
+    expected: int | None = None
     pairs_a_round: int = 100_000
     hypotheses_a_round: int = 200_000
     facing_only: bool = True
@@ -106,6 +106,7 @@ class SearchParameters:
             limit is not None or self.miss_probability > 0.0, "time_limit_s", limit, "given where miss_probability is 0"
         )
         require(self.max_instances is None or self.max_instances >= 1, "max_instances", self.max_instances, "1 or more")
+        require(self.expected is None or self.expected >= 1, "expected", self.expected, "1 or more")
         require(0.0 < self.chance_overlap < 0.5, "chance_overlap", self.chance_overlap, "above 0 and below 0.5")
         require(self.normal_length_m >= 0.0, "normal_length_m", self.normal_length_m, "0 or more metres")
         require(self.test_cells_across >= 4.0, "test_cells_across", self.test_cells_across, "4 or more")
@@ -203,6 +204,7 @@ class Search:
         self.pool = np.empty(0, np.intp)
         self._fill_pool()
         self._expected = np.zeros(len(models))
+        self._served = np.zeros(len(models), np.bool_)  # models of which no further instance is wanted
         self._learned = np.zeros((len(models), 2))  # hits, and what was shown, of the instances found
         self._sides = 1 if scene.fine.signed and all(m.signed for m in models) else 4
         self._look_for(parameters.overlap_ratio)
@@ -222,6 +224,10 @@ class Search:
         self._look_for(deeper)
         self._until = self.effort + DEEPER_ROUNDS
         return True
+
+    def served(self, models: NDArray[np.bool_]) -> None:
+        """Of these models (models,) no further instance is wanted: the search need not go on for them."""
+        self._served = models
 
     def withdraw(self, cells: NDArray[np.bool_]) -> None:
         """Draw no more from these cells (V,): they are explained."""
@@ -296,7 +302,7 @@ class Search:
     def chance_missed(self) -> float:
         """Chance to have missed an instance that shows λs of its surface, for the model worst served so far."""
         expected = np.where(self._learned[:, 1] > 0.0, self.effort * self._rate(), self._expected)
-        return exp(-float(expected.min()))
+        return exp(-float(expected.min(initial=np.inf, where=~self._served)))
 
     def _share(self) -> float:
         """The share of a full round that the next one needs be: as much as is missing."""
@@ -412,9 +418,8 @@ class Search:
         share = np.where(count > 0, np.bincount(tested, minlength=cells) / np.maximum(count, 1), 1.0)
         for number, model in enumerate(self.models):
             samples, rung_of_pair = len(model.samples), model.pairs.keys // self.pairs.cells_per_rung()
-            area = AREA_OF_A_SAMPLE * samples * model.spacing**2
             # What of an instance that shows λs of its surface would be in the pool.
-            on_it = shown * area / fine.cell**2 * float((self.model_shapes[number] * self._kept).sum())
+            on_it = shown * model.exposed_area() / fine.cell**2 * float((self.model_shapes[number] * self._kept).sum())
             first_on_it = min(1.0, on_it / max(len(self.pool), 1))
             for rung in rungs_of(model.diameter, model.parameters.pairs):
                 keys = model.pairs.keys[rung_of_pair == rung]

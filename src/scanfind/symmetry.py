@@ -112,13 +112,17 @@ class Symmetry:
         A part that stands as it was drawn stays so; a sphere is not turned at all. Otherwise it is the one nearest to a
         rotation somewhat off none, see `LEANING`.
         """
+        return self.nearest(pose, np.eye(3) if self.sphere else self._reference)
+
+    def nearest(self, pose: Pose, rotation: Floats) -> Pose:
+        """Of the poses that look the same as target_from_model the one that is turned the least from a rotation."""
         if self.sphere:
-            return pose @ self._about_centre(pose.rotation.T)
-        reference, turns = self._reference, self.turns
+            return pose @ self._about_centre(pose.rotation.T @ rotation)
+        turns = self.turns
         for axis in self.free[:1]:
-            rolls = [roll_of(reference.T @ pose.rotation @ turn, axis) for turn in turns]
+            rolls = [roll_of(rotation.T @ pose.rotation @ turn, axis) for turn in turns]
             turns = np.array([turn @ turn_about(axis, -roll) for turn, roll in zip(turns, rolls, strict=True)])
-        near = np.einsum("ij,ik,gkj->g", reference, pose.rotation, turns)
+        near = np.einsum("ij,ik,gkj->g", rotation, pose.rotation, turns)
         return pose @ self._about_centre(turns[int(np.argmax(near))])
 
     @cached_property

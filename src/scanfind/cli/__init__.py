@@ -13,6 +13,7 @@ from cyclopts import App, CycloptsError, MissingArgumentError
 
 from scanfind.cli.find import find
 from scanfind.cli.info import info
+from scanfind.cli.inspect import inspect
 from scanfind.cli.isolate import isolate
 from scanfind.cli.library import library
 from scanfind.cli.options import note
@@ -35,6 +36,7 @@ def _version() -> str:
 
 app = App(name="scanfind", help=HELP, version=_version, help_format="plaintext", suppress_keyboard_interrupt=False)
 app.command(find, usage="scanfind find SCAN... (--model FILE... | --library LIB) [OPTIONS]")
+app.command(inspect, usage="scanfind inspect SCAN... --design FILE... [OPTIONS]")
 app.command(library)
 app.command(isolate, usage="scanfind isolate RESULT_DIR SCAN... [OPTIONS]")
 app.command(info, usage="scanfind info FILE... [--json]")

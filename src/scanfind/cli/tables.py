@@ -2,20 +2,38 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from math import atan2, degrees, hypot
 from typing import TYPE_CHECKING
 
 from scanfind.detection import OFF_M
+from scanfind.elements import (
+    IN_TOLERANCE,
+    INSTALLED,
+    NO_DATA,
+    NOT_ENOUGH_DATA,
+    NOT_FOUND,
+    OCCLUDED,
+    OUT_OF_TOLERANCE,
+    UNCERTAIN,
+)
 
 if TYPE_CHECKING:
-    from scanfind.schema import DetectionEntry, Matrix, PartEntry, RefusedEntry, Results
+    from scanfind.schema import DetectionEntry, ElementEntry, Matrix, PartEntry, RefusedEntry, Results
     from scanfind.simulate import Sight
 
 FOUND = (
     "id", "model", "x m", "y m", "z m", "yaw °", "pitch °", "roll °", "score", "visible %", "rms mm", "± mm", "± °",
     "points", "mean mm", "95 % mm", "free to",
 )  # fmt: skip
+
+ELEMENTS = ("element", "class", "status", "verdict", "id", "off mm", "x mm", "y mm", "z mm", "turned °", "why")
+# What needs a look first.
+ORDER = [
+    *((status, None) for status in (NOT_FOUND, UNCERTAIN)), (INSTALLED, OUT_OF_TOLERANCE),
+    *((status, None) for status in (OCCLUDED, NOT_ENOUGH_DATA, NO_DATA, INSTALLED)), (INSTALLED, IN_TOLERANCE),
+]  # fmt: skip
 
 PARTS = ("id", "part", "status", "off mm", "± mm", "x mm", "y mm", "z mm", "turned °", "± °", "joined to", "free to")
 
@@ -48,6 +66,22 @@ def parts_table(results: Results) -> str:
     parts = [(found, part) for found in results.detections for part in found.parts]
     rows = [_part_row(found, part) for found, part in parts if part.status == "missing" or _is_off(part)]
     return table(PARTS, rows) if rows else ""
+
+
+def elements_table(results: Results) -> str:
+    """One line an element of the design, what needs a look first; x, y, z: its middle's shift in the scan's axes."""
+    rows = sorted(results.elements, key=lambda each: (ORDER.index((each.status, each.verdict)), each.name))
+    return table(ELEMENTS, [_element_row(each) for each in rows])
+
+
+def elements_in_words(results: Results) -> str:
+    """How many elements have which status, in one line."""
+    counts = Counter(each.status for each in results.elements)
+    told = [f"{count} {status.replace('_', ' ')}" for status, count in counts.most_common()]
+    if results.allowed_m is not None:
+        off = sum(each.verdict == OUT_OF_TOLERANCE for each in results.elements)
+        told.append(f"{off} out of tolerance ({results.allowed_m * 1e3:g} mm)")
+    return f"{len(results.elements)} elements of the design: {', '.join(told)}"
 
 
 def sight_table(sights: Sequence[Sight]) -> str:
@@ -119,6 +153,20 @@ def _part_row(found: DetectionEntry, part: PartEntry) -> list[str]:
         _number(sigma, 2),
         part.joined_to or "–",
         ", ".join(motion.kind for motion in part.free) or "–",
+    ]
+
+
+def _element_row(each: ElementEntry) -> list[str]:
+    return [
+        each.name or each.model,
+        each.ifc_class or "–",
+        each.status.replace("_", " "),
+        (each.verdict or "–").replace("_", " "),
+        "–" if each.detection is None else str(each.detection),
+        _number(each.off_m, 1, 1e3),
+        *(_number(value, 1, 1e3) for value in each.shift_m or (None, None, None)),
+        _number(None if each.turn_rad is None else degrees(each.turn_rad), 2),
+        each.why,
     ]
 
 

@@ -1,0 +1,141 @@
+"""`scanfind inspect`: a design and scans in; what became of every element, and how far off it is."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from scanfind.cli.options import Count, Flag, Format, Metres, Names, Paths, Position, Seconds, Units, note, say
+from scanfind.errors import UsageError
+
+if TYPE_CHECKING:
+    from scanfind.schema import Results
+
+FAILED = 3
+
+
+def inspect(
+    scans: Annotated[list[Path], Parameter(name="SCAN", negative=())],
+    /,
+    *,
+    design: Paths,
+    select: Names | None = None,
+    units: Units | None = None,
+    origin: Position | None = None,
+    allowed: Metres | None = None,
+    out: Path | None = None,
+    format: Format | None = None,
+    overwrite: Flag = False,
+    json: Flag = False,
+    config: Path | None = None,
+    seed: Count | None = None,
+    jobs: Count | None = None,
+    tolerance: Metres | None = None,
+    time_limit: Seconds | None = None,
+    fail_on: Literal["not-found", "out-of-tolerance"] | None = None,
+) -> int:
+    """Say what became of every element of a design: is it there, and how far from where it should be?
+
+    The scans are in the design's frame. Each element is looked for where the design puts it, then anywhere.
+
+    For example:
+
+        scanfind inspect hall.e57 --design steel.ifc --select IfcBeam --allowed 0.01 --out inspected
+
+    Parameters
+    ----------
+    scans
+        Scan files: E57, LAS, LAZ, PLY, PCD, PTX, PTS, XYZ, CSV. They come before --design.
+    design
+        An IFC file, or models drawn where they should stand: STL, OBJ, PLY, GLB, OFF, 3MF, STEP.
+    select
+        Of an IFC file only these: class, name or GlobalId.
+    units
+        Of model files whose format does not say; metres unless given.
+    origin
+        X,Y,Z where the scanner stood, metres, for scans that do not say.
+    allowed
+        By how much an element may be off, metres; without it nothing is in or out of tolerance.
+    out
+        A new folder for statuses, poses and points; nothing is written without it.
+    format
+        Of the isolated point clouds; ply unless given.
+    overwrite
+        Replace an older result in --out.
+    json
+        Print results.json on stdout instead of a table.
+    config
+        A TOML file of settings; flags and SCANFIND_... variables win over it.
+    seed
+        Of the random draws: the same seed gives the same answer; 0 unless given.
+    jobs
+        Threads; one a core unless given.
+    tolerance
+        Points this near to a found element are its own, metres.
+    time_limit
+        Look for elements that are not in their place no longer than this, seconds.
+    fail_on
+        Exit with 3 if some element was not found, or is not found or out of tolerance.
+
+    """
+    if allowed is not None and not allowed > 0.0:
+        msg = f"inspect: --allowed is a length above 0, in metres, got {allowed:g}"
+        raise UsageError(msg)
+    if fail_on == "out-of-tolerance" and allowed is None:
+        msg = "inspect: --fail-on out-of-tolerance needs to know how much is allowed: give --allowed M"
+        raise UsageError(msg)
+
+    from scanfind.cli.inputs import open_models
+    from scanfind.config import load_settings
+    from scanfind.document import document, model_entries
+    from scanfind.find import find
+    from scanfind.parameters import PRESETS
+    from scanfind.progress import progress_on
+    from scanfind.results import fill_folder, result_folder
+
+    flags = {
+        "seed": seed, "jobs": jobs, "units": units, "origin": origin, "format": format, "select": select,
+        "search.time_limit_s": time_limit, "isolate.tolerance_m": tolerance,
+    }  # fmt: skip
+    run, parameters = load_settings(PRESETS, flags, config)
+    with ExitStack() as stack:
+        folder = None if out is None else stack.enter_context(result_folder(out, overwrite=overwrite))
+        models = stack.enter_context(open_models(design, None, run, parameters))
+        progress = stack.enter_context(progress_on())
+        findings = find(
+            scans, models, parameters=parameters, seed=run.seed, jobs=run.jobs, origin=run.origin,
+            progress=progress, at_design=True,
+        )  # fmt: skip
+        findings.allowed_m = allowed
+        if folder is None:
+            results = document(findings, models=model_entries(models), parameters=parameters, seed=run.seed)
+        else:
+            results = fill_folder(
+                folder, findings, models=models, parameters=parameters, seed=run.seed, format=run.format,
+                progress=progress,
+            )  # fmt: skip
+    report(results, out, json=json)
+    return FAILED if fail_on and failed(results, fail_on) else 0
+
+
+def report(results: Results, out: Path | None, *, json: bool) -> None:
+    """The table (or results.json) on stdout; on stderr the sum of it and where it lies."""
+    from scanfind.cli.tables import elements_in_words, elements_table
+
+    say(results.to_json() if json else elements_table(results))
+    for remark in results.notes:
+        note(remark)
+    points = sum(scan.points for scan in results.scans)
+    where = "nothing written, give --out DIR to keep it" if out is None else f"results in {out}"
+    note(f"{elements_in_words(results)}; {points:,} points, {results.timings_s['total']:.1f} s; {where}")
+
+
+def failed(results: Results, on: str) -> bool:
+    """Is some element not found or, where that is asked, out of tolerance?"""
+    from scanfind.elements import NOT_FOUND, OUT_OF_TOLERANCE
+
+    bad = {"not-found": {NOT_FOUND}, "out-of-tolerance": {NOT_FOUND, OUT_OF_TOLERANCE}}[on]
+    return any(each.status in bad or each.verdict in bad for each in results.elements)
