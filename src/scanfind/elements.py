@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from scanfind.mesh import Placement
 from scanfind.pose import Pose
+from scanfind.refine import held
 from scanfind.symmetry import pose_error
 
 if TYPE_CHECKING:
@@ -121,11 +122,28 @@ def off_by(model: Model, points: Floats, found: Pose, design: Pose) -> float:
 def installed(model: Model, placement: Placement, found: Detection, spoken: Spoken | None) -> Element:
     """An element that is there, and how far from where the design puts it."""
     design, centre = placement.design_from_model, model.symmetry.centre[None]
-    x, y, z = (found.scene_from_model.move(centre) - design.move(centre))[0].tolist()
-    turn = pose_error(found.scene_from_model, design, model.symmetry).rotation_rad
-    off = off_by(model, model.samples.points, found.scene_from_model, design)
+    stands = drawn_back(model, found, design)
+    x, y, z = (stands.move(centre) - design.move(centre))[0].tolist()
+    turn = pose_error(stands, design, model.symmetry).rotation_rad
+    off = off_by(model, model.samples.points, stands, design)
     why = f"found with score {found.score:.2f}: {found.coverage:.0%} of its surface lies on the scan"
     return Element(placement, model.name, INSTALLED, found.id, (x, y, z), turn, off, *shares(spoken), why)
+
+
+def drawn_back(model: Model, found: Detection, design: Pose) -> Pose:
+    """Where an element stands, as designed along the motions that the scan hardly fixes."""
+    alike = model.symmetry.nearest(found.scene_from_model, design.rotation)
+    if found.covariance is None or found.pivot is None:
+        return alike
+    middle = found.scene_from_model.inverse().move(np.array(found.pivot)[None])
+    radius = 0.5 * model.diameter
+    scale = np.array([radius] * 3 + [1.0] * 3)
+    information = np.asarray(
+        np.linalg.pinv(found.covariance * np.outer(scale, scale), rcond=1e-9, hermitian=True), np.float64
+    )
+    # The pivot is in the middle of what was seen; a symmetry may have turned that elsewhere.
+    there = alike.inverse().move(found.scene_from_model.move(middle))[0]
+    return held(design, alike, information, there, radius)
 
 
 def missed(model: Model, placement: Placement, spoken: Spoken | None) -> Element:

@@ -146,9 +146,9 @@ def recognise(
     found = Recognition(scene, size.models, table, parameters, seed, jobs, standing)
     for hypotheses in found.at_design() if at_design else ():
         with clock("refine"):
-            poses = found.refine(hypotheses)
+            poses = found.refine_in_place(hypotheses)
         with clock("verify"):
-            found.believe(None, poses)
+            found.believe_in_place(poses)
     while found.wants_more(clock.elapsed("search", "refine", "verify") / size.patience):
         tell("search", size.progress(found.progress()), 1.0)
         with clock("search"):

@@ -129,6 +129,17 @@ def rotation_from_vector(vector: ArrayLike) -> Floats:
     return rotation
 
 
+def rotation_vector(rotation: Floats) -> Floats:
+    """Axis × angle (3,), radians up to π, of a rotation (3, 3); the inverse of `rotation_from_vector`."""
+    quaternion = Pose(rotation, np.zeros(3)).quaternion()
+    axis = np.array([quaternion[part] for part in "xyz"])
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-12:
+        return np.zeros(3)
+    angle = 2.0 * np.arctan2(sine, quaternion["w"])
+    return axis / sine * float(angle - 2.0 * np.pi if angle > np.pi else angle)
+
+
 def random_rotation(rng: np.random.Generator) -> Floats:
     """A rotation (3, 3) drawn uniformly (normalised Gaussian quaternion)."""
     x, y, z, w = (q := rng.standard_normal(4)) / np.linalg.norm(q)

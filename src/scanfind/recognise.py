@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from scanfind.assembly import Assemblies, Explained, View
 from scanfind.detection import Detection, Motion, Refused
-from scanfind.elements import Element, elements_of, placements_of
+from scanfind.elements import LEAST_LOOKED_AT, Element, elements_of, placements_of
 from scanfind.free_space import Limits, Spoken, caster_of, spoken_of
 from scanfind.near_surface import signed_distances
 from scanfind.pose import Pose
-from scanfind.refine import Refined, covariance_of, icp, shrinking, triple, unobservable
+from scanfind.refine import Refined, covariance_of, held, icp, shrinking, triple, unobservable
 from scanfind.search import Hypotheses, Search, model_arrays
 from scanfind.verify import (
     Evidence,
@@ -57,6 +57,9 @@ PROMISING = 0.67
 SURE = 0.98
 NET_PENALTY = 2.0
 WEARY = 12  # poses of a model tried in parts, from which on only what comes closer than any of these is tried
+DRAWN_IN_CELLS = (2.0, 0.75)  # of the largest: how far off its design an element is met at once …
+FARTHER_IF = 1.2  # … where so many more of its samples meet the scan there than about the design
+IN_PLACE_M = 0.03  # what ICP carried no farther off is still where the design puts it
 REFUSED_SHOWN = 3  # of each model: what came closest
 
 
@@ -69,6 +72,7 @@ class Candidate(NamedTuple):
     score : 0 … 1; area : supported surface, counted by how much it tells, less what was seen through, m²: by it
         conflicting poses are ranked
     whole : its parts, where they were fitted: of a pose that is believed by them alone
+    in_place : the design puts it there; what adjoins it by design may share its surface
     """
 
     model: int
@@ -80,6 +84,7 @@ class Candidate(NamedTuple):
     score: float
     area: float
     whole: Explained | None = None
+    in_place: bool = False
 
 
 class Standing(NamedTuple):
@@ -181,6 +186,25 @@ class Recognition:
         # What ended at one place is asked once.
         return fine.take(distinct(fine.hypotheses, self.arrays, self._the_same, kept, 2 * kept))
 
+    def refine_in_place(self, hypotheses: Hypotheses) -> Refined:
+        """Poses the design gives, as they are; then each after ICP, drawn in from farther away where that meets more.
+
+        Along what the scan hardly fixes ICP may carry an element off to where its neighbours begin: it is held back.
+        """
+        refine, around = self.parameters.refine, self.scene.around
+        gates = shrinking(DRAWN_IN_CELLS, refine.coarse_iterations, around.cell)
+        near, far = self._icp_coarse(hypotheses), self._icp(hypotheses, around, gates, refine.coarse_samples)
+        far = self._icp_coarse(far.hypotheses)
+        farther = far.matched > FARTHER_IF * near.matched
+        start = joined([near.hypotheses, far.hypotheses]).take(np.arange(len(farther)) + len(farther) * farther)
+        found = self._icp_fine(start)
+        for k, number in enumerate(hypotheses.models):
+            design, pose = (Pose(h.rotations[k], h.translations[k]) for h in (hypotheses, found.hypotheses))
+            pose = held(design, pose, found.hessians[k], self.arrays.centres[number], float(self.arrays.radii[number]))
+            found.hypotheses.rotations[k], found.hypotheses.translations[k] = pose.rotation, pose.translation
+        both = joined([hypotheses, found.hypotheses])
+        return Refined(both, np.tile(found.hessians, (2, 1, 1)), np.tile(found.matched, 2), np.tile(found.rms, 2))
+
     def _promising(self, hypotheses: Hypotheses, shown: int) -> NDArray[np.intp]:
         """Those whose evidence on the coarse surfels is not hopeless, and the best `shown` of each model (indices)."""
         verify = self.parameters.verify
@@ -229,8 +253,8 @@ class Recognition:
     def _no_rows(self) -> NDArray[np.bool_]:
         return np.zeros(len(self.scene.fine.sides), np.bool_)
 
-    def candidates(self, refined: Refined) -> list[Candidate]:
-        """Refined poses with their evidence."""
+    def candidates(self, refined: Refined, *, in_place: bool = False) -> list[Candidate]:
+        """Refined poses with their evidence; in_place : of where the design puts the models."""
         self._fit_near(refined.hypotheses, ceil(self.parameters.verify.gate_cells))
         found = []
         for k, seen in enumerate(self._evidence(refined.hypotheses)):
@@ -240,8 +264,8 @@ class Recognition:
             found.append(
                 Candidate(
                     number, refined.hypotheses.rotations[k], refined.hypotheses.translations[k], refined.hessians[k],
-                    float(refined.rms[k]), seen, score(seen, self.blind, self.parameters.verify),
-                    net * self.models[number].area_of_a_sample(),
+                    float(refined.rms[k]), seen, score(seen, self.blind, self.parameters.verify, in_place=in_place),
+                    net * self.models[number].area_of_a_sample(), in_place=in_place,
                 )
             )  # fmt: skip
         return found
@@ -269,12 +293,52 @@ class Recognition:
             self._casters[number] = caster_of(self.models[number])
         return self._casters[number]
 
-    def believe(self, hypotheses: Hypotheses | None, refined: Refined) -> None:
+    def believe_in_place(self, refined: Refined) -> None:
+        """Of poses the design gives, as `refine_in_place` leaves them, believe the better of each pair if it holds.
+
+        What lies where the design puts it need not be of a telling shape, may adjoin others, and is not asked what else
+        it could be taken for. What ICP carried away from there must stand as one found anywhere would.
+        """
+        found, verify, claimed = self.candidates(refined, in_place=True), self.parameters.verify, self._no_rows()
+        elsewhere = []
+        for asked, moved in zip(found[: len(found) // 2], found[len(found) // 2 :], strict=True):
+            best = max(moved, asked, key=lambda candidate: candidate.score)
+            if self._apart(best, asked) > IN_PLACE_M:
+                elsewhere.append(best._replace(score=score(best.evidence, self.blind, verify), in_place=False))
+            elif reason := self._why_not_in_place(best):
+                self._refused.append((best, reason))
+            else:
+                self.believed.append(best)
+        for candidate in self.believed:
+            self._claim(candidate, claimed)
+        for candidate in sorted(elsewhere, key=lambda c: -c.area):
+            if reason := why_refused(candidate.evidence, self.blind, verify):
+                self._refused.append((candidate, reason))
+            elif not self._shares(candidate, claimed):
+                self.believed.append(candidate)
+                self._claim(candidate, claimed)
+        self._settled(claimed)
+
+    def _why_not_in_place(self, candidate: Candidate) -> str:
+        """Why an element is not believed to stand where the design puts it; empty where it is."""
+        on, beside, through, _ = candidate.evidence.spoken
+        enough = LEAST_LOOKED_AT * self.models[candidate.model].exposed_area()
+        if not self.blind and on + beside + through < enough:
+            return "scanners looked at too little of it to be sure"
+        return why_refused(candidate.evidence, self.blind, self.parameters.verify, in_place=True)
+
+    def _apart(self, one: Candidate, other: Candidate) -> float:
+        """How far the sample that two poses of one model part the most is from where it was, metres."""
+        points = self.models[one.model].samples.points
+        moved = points @ (one.rotation - other.rotation).T + one.translation - other.translation
+        return float(np.linalg.norm(moved, axis=1).max())
+
+    def believe(self, hypotheses: Hypotheses, refined: Refined) -> None:
         """Accept what the evidence carries; of poses that claim one surface, the one that explains most of it.
 
         Papazov & Burschka's conflict graph, solved greedily by the surface a pose explains.
 
-        hypotheses : of the round, to learn how often an instance is hit; None where they were not drawn
+        hypotheses : of the round, to learn how often an instance is hit
         refined : what became of the best of them, see `refine`
         """
         verify, settled = self.parameters.verify, {id(candidate) for candidate in self.believed}
@@ -290,7 +354,8 @@ class Recognition:
         self._refused += refused
         claimed, believed = self._no_rows(), []
         for candidate in sorted([*self.believed, *fresh], key=lambda c: -c.area):
-            if self._shares(candidate, claimed) or self._stands_elsewhere(candidate):
+            taken = not candidate.in_place and (self._shares(candidate, claimed) or self._stands_elsewhere(candidate))
+            if taken:
                 self._refused.append((candidate, "another pose explains more of the same surface"))
                 continue
             best = candidate
@@ -298,11 +363,14 @@ class Recognition:
                 best = self._best_of_similar(candidate)
                 if best is not candidate and self._shares(best, claimed):
                     continue  # turned over, it is one we have
-                if hypotheses is not None:
-                    self.search.learn(best.model, self._hits(hypotheses, best), best.evidence.support())
+                self.search.learn(best.model, self._hits(hypotheses, best), best.evidence.support())
             believed.append(best)
             self._claim(best, claimed)
         self.believed = self._shown_alike(believed) if self.blind else believed
+        self._settled(claimed)
+
+    def _settled(self, claimed: NDArray[np.bool_]) -> None:
+        """What is believed claims these rows (…,): nothing more is drawn there."""
         self._refused = closest(self._refused)
         found = np.bincount([c.model for c in self.believed], minlength=len(self.models))
         self.search.served(found >= self._wanted)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from scanfind.detection import Motion
 from scanfind.errors import require
+from scanfind.pose import Pose, rotation_from_vector, rotation_vector
 from scanfind.search import Hypotheses, ModelArrays
 from scanfind.threads import in_threads
 
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from scanfind.surfels import Surfels
 
 Floats = NDArray[np.float64]
+
+# How strongly an element is taken to be where the design puts it, as against what the data say of a motion on average.
+HELD = 0.02
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,23 @@ def icp(
 def shrinking(first_last: tuple[float, float], steps: int, cell: float) -> Floats:
     """Gates from first to last, geometric, in metres."""
     return cell * np.geomspace(*first_last, steps)
+
+
+def held(design: Pose, found: Pose, information: Floats, middle: Floats, radius: float) -> Pose:
+    """A pose drawn back to the design's along the motions that the data hardly fix, as far as they do not.
+
+    A beam slides along itself to where its neighbours' surfaces begin, and nearly nothing says it should not. With a
+    prior as strong as HELD of what the data say on average, the likeliest pose.
+
+    information : (6, 6), any unit, of rotation × radius and translation of the middle, scene axes
+    middle : (3,) of the model, its own frame; radius : metres
+    """
+    at, there = design.move(middle[None])[0], found.move(middle[None])[0]
+    turn = rotation_vector(found.rotation @ design.rotation.T) * radius
+    prior = HELD * np.trace(information) / 6.0 * np.eye(6)
+    kept = np.linalg.solve(information + prior, information @ np.concatenate([turn, there - at]))
+    rotation = rotation_from_vector(kept[:3] / radius) @ design.rotation
+    return Pose(rotation, at + kept[3:] - rotation @ middle)
 
 
 def covariance_of(hessian: Floats, rms: float, radius: float, below: float) -> Floats:

@@ -118,15 +118,18 @@ class Evidence(NamedTuple):
         return self.spoken.on / seen if seen else 0.0
 
 
-def score(evidence: Evidence, blind: bool, parameters: VerifyParameters) -> float:
+def score(evidence: Evidence, blind: bool, parameters: VerifyParameters, *, in_place: bool = False) -> float:
     """0 … 1: the share of the looked-at surface that is there, less the weighted share that is not (Papazov 2010).
 
     blind : no scanner position is known; then only support speaks, and half the surface is all that is expected of it
+    in_place : the design puts it there, so that it is not there by chance, whatever its shape
     """
     if blind:
         return min(1.0, evidence.support() / EXPECTED_BLIND)
     on, beside, through, _ = evidence.spoken
     weighed = on + parameters.beside_weight * beside + parameters.penalty_weight * through
+    if in_place:
+        return on / weighed if weighed else 0.0
     # Few supported samples can agree by chance: the visible share is believed as far as their number goes. More than
     # half of a part lies on no floor or wall, whatever its shape tells: where a scan shows it alone, nothing tells.
     believed = evidence.telling + max(0.0, evidence.support() - 0.5)
@@ -141,12 +144,12 @@ def rough_score(rough: Rough, blind: bool) -> float:
     return rough.supported / spoken if spoken else 0.0
 
 
-def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters) -> str:
-    """Why a pose is not believed, in words; empty where it is."""
+def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters, *, in_place: bool = False) -> str:
+    """Why a pose is not believed, in words; empty where it is. in_place : see `score`."""
     least = parameters.min_support_blind if blind else parameters.min_support
     if evidence.support() < least:
         return f"only {evidence.support():.0%} of its surface lies on the scan, {least:.0%} is asked for"
-    if score(evidence, blind, parameters) >= parameters.min_score:
+    if score(evidence, blind, parameters, in_place=in_place) >= parameters.min_score:
         return ""
     if blind:
         return f"{evidence.support():.0%} of its surface lies on the scan, and no free space is known to tell more"
