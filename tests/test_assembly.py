@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from scanfind.assembly import AssemblyParameters, assembly_of
 from scanfind.assembly.explain import free_and_held, moved_by, without
-from scanfind.assembly.fit import apart, placed, rotation_vector
+from scanfind.assembly.fit import apart, placed
 from scanfind.assembly.members import connected, members
 from scanfind.assembly.parts import Assembly, first_cut, merged, told_apart
 from scanfind.assembly.points import fitted_to_points
@@ -25,7 +25,7 @@ from scanfind.mesh import Mesh
 from scanfind.models.parts import Part, join
 from scanfind.pairs import PairParameters
 from scanfind.parameters import PRESETS
-from scanfind.pose import Pose, rotation_from_vector
+from scanfind.pose import Pose, rotation_from_vector, rotation_vector
 from scanfind.scene import GridParameters
 from scanfind.simulate.furniture import hall
 from scanfind.simulate.objects import RIGHT_ANGLE, Route

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [README, *(page.read_text(encoding="utf-8") for page in sorted((ROOT / "docs").glob("*.md")))]
 COMMANDS = [
-    ("find",), ("isolate",), ("info",), ("library", "add"), ("library", "list"), ("library", "show"),
+    ("find",), ("inspect",), ("isolate",), ("info",), ("library", "add"), ("library", "list"), ("library", "show"),
     ("library", "remove"), ("simulate",),
 ]  # fmt: skip
 # Enough for the examples to come to an end; how well they find is for other tests to say.
@@ -132,6 +132,8 @@ def test_the_examples_of_every_help_run(
 
     shutil.copy(ROOT / "examples" / "pump" / "scan.e57", tmp_path / "shop.e57")
     shutil.copy(shared_data / "cad" / "box_sides.STEP", tmp_path / "frame.step")
+    lift = shared_data / "ifc" / "schependomlaan" / "ROOT-prefab_vloer_lifttop" / "IFC-prefab_vloer_lifttop.ifc"
+    shutil.copy(lift, tmp_path / "steel.ifc")
     trimesh.creation.cylinder(radius=88.0, height=600.0).export(tmp_path / "spool.stl")
     trimesh.creation.annulus(r_min=50.0, r_max=90.0, height=20.0).export(tmp_path / "flange.stl")
     (chunk,) = read_scan(tmp_path / "shop.e57")
@@ -140,7 +142,17 @@ def test_the_examples_of_every_help_run(
             writer.write(chunk.xyz[half], {"intensity": np.ones(len(chunk.xyz[half]), np.uint16)})
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(TIME_LIMIT, "1")  # the spool of the examples is not in this scan
-    order = ["simulate", "library add", "library list", "library show", "find", "isolate", "info", "library remove"]
+    order = [
+        "simulate",
+        "library add",
+        "library list",
+        "library show",
+        "find",
+        "inspect",
+        "isolate",
+        "info",
+        "library remove",
+    ]
     for command in order:
         for example in _examples(_help(tuple(command.split()), capsys)):
             code = main(shlex.split(_thinner(example))[1:])

@@ -36,6 +36,9 @@ LEAST_ASKED, LEAST_LOOKED_AT = 0.02, 0.1
 # Of the surface looked at: so much of it there, and something stands in its place that may be the element; so much
 # passed through or beside what was met, and it is not there.
 MAY_BE, IS_NOT = 0.5, 0.7
+# Farther from its place than this and it may as well be another part of the same shape.
+FAR_M = 0.5
+SAID_M = 0.002  # what a motion that is held at the design's would add is told from here on
 IN_TOLERANCE, OUT_OF_TOLERANCE = "in_tolerance", "out_of_tolerance"
 PAIRED_BY = 50  # samples, which lie evenly over the model: they tell which of two places is nearer
 
@@ -45,10 +48,11 @@ class Element:
     """One product of the design, and what the scans say of it.
 
     placement : its GlobalId, class, name, and where the design puts it, in the scans' frame; model : of which geometry
-    status : one of STATUSES; detection : the id of the instance that is taken for it; None unless installed
+    status : one of STATUSES
+    detection : the id of the instance that is taken for it, or stands far off and may be it
     shift_m : (3,) of its middle from where the design puts it, in the scans' axes; turn_rad : by what angle it is
-        turned, symmetry not counted; off_m : how far the point of its surface that moved the most did. None unless
-        installed
+        turned, symmetry not counted; off_m : how far the point of its surface that moved the most did. None without
+        a detection
     on, beside, through, hidden : what beams say at the design's place, as shares of the surface they went to: they
         ended on it, near it but not on it, behind it, or before it. None where no scanner position is known
     why : the evidence in words
@@ -69,7 +73,7 @@ class Element:
 
     def verdict(self, allowed_m: float | None) -> str | None:
         """Is it where it should be to within so many metres? None where it was not found or nobody says how far."""
-        if self.off_m is None or allowed_m is None:
+        if self.off_m is None or allowed_m is None or self.status != INSTALLED:
             return None
         return IN_TOLERANCE if self.off_m <= allowed_m else OUT_OF_TOLERANCE
 
@@ -126,7 +130,14 @@ def installed(model: Model, placement: Placement, found: Detection, spoken: Spok
     x, y, z = (stands.move(centre) - design.move(centre))[0].tolist()
     turn = pose_error(stands, design, model.symmetry).rotation_rad
     off = off_by(model, model.samples.points, stands, design)
+    if off > FAR_M:
+        _, there = status_at(spoken, model.exposed_area())
+        why = f"where it should be {there}; one of its shape stands {off:.2f} m off"
+        return Element(placement, model.name, UNCERTAIN, found.id, (x, y, z), turn, off, *shares(spoken), why)
     why = f"found with score {found.score:.2f}: {found.coverage:.0%} of its surface lies on the scan"
+    further = off_by(model, model.samples.points, found.scene_from_model, design) - off
+    if further > SAID_M:
+        why += f"; {1e3 * further:.0f} mm more, along a motion the scan hardly fixes, are left out"
     return Element(placement, model.name, INSTALLED, found.id, (x, y, z), turn, off, *shares(spoken), why)
 
 

@@ -59,7 +59,7 @@ NET_PENALTY = 2.0
 WEARY = 12  # poses of a model tried in parts, from which on only what comes closer than any of these is tried
 DRAWN_IN_CELLS = (2.0, 0.75)  # of the largest: how far off its design an element is met at once …
 FARTHER_IF = 1.2  # … where so many more of its samples meet the scan there than about the design
-IN_PLACE_M = 0.03  # what ICP carried no farther off is still where the design puts it
+IN_PLACE_M = 0.06  # what ICP carried no farther off is still where the design puts it
 REFUSED_SHOWN = 3  # of each model: what came closest
 
 
@@ -353,7 +353,7 @@ class Recognition:
             fresh += self._explained_by_parts([candidate for candidate, _ in refused], [*self.believed, *fresh])
         self._refused += refused
         claimed, believed = self._no_rows(), []
-        for candidate in sorted([*self.believed, *fresh], key=lambda c: -c.area):
+        for candidate in sorted([*self.believed, *fresh], key=lambda c: (not c.in_place, -c.area)):
             taken = not candidate.in_place and (self._shares(candidate, claimed) or self._stands_elsewhere(candidate))
             if taken:
                 self._refused.append((candidate, "another pose explains more of the same surface"))

@@ -21,7 +21,6 @@ from scanfind.assembly.fit import (
     View,
     apart,
     hypotheses,
-    rotation_vector,
     skew,
 )
 from scanfind.assembly.parts import Assembly, assembly_of
@@ -30,7 +29,7 @@ from scanfind.cloud import OrientedCloud
 from scanfind.detection import PartFit
 from scanfind.free_space import Limits, caster_of, spoken_of
 from scanfind.mesh import Mesh
-from scanfind.pose import Pose, nearest_rotation, rotation_from_vector
+from scanfind.pose import Pose, nearest_rotation, rotation_from_vector, rotation_vector
 from scanfind.refine import motion_of, triple
 from scanfind.verify import Evidence, gather_support, why_refused
 

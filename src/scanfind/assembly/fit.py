@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.pose import Pose, nearest_rotation, rotation_from_vector
+from scanfind.pose import Pose, nearest_rotation, rotation_from_vector, rotation_vector
 from scanfind.search import Hypotheses
 from scanfind.verify import Level, held_against, spread
 
@@ -412,17 +412,6 @@ def skew(vector: Floats) -> Floats:
     """The matrix (3, 3) whose product with another vector is the cross product of the two."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-def rotation_vector(rotation: Floats) -> Floats:
-    """Axis × angle (3,), radians, of a rotation (3, 3) of less than half a turn."""
-    twice = np.array([
-        rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]
-    ])  # fmt: skip
-    sine = float(np.linalg.norm(twice))
-    angle = float(np.arctan2(sine, np.trace(rotation) - 1.0))
-    vector: Floats = twice * (0.5 if sine < 1e-9 else angle / sine)
-    return vector
 
 
 def apart(pose: Pose, other: Pose, place: Floats) -> tuple[float, float]:

@@ -43,7 +43,7 @@ def inspect(
 
     For example:
 
-        scanfind inspect hall.e57 --design steel.ifc --select IfcBeam --allowed 0.01 --out inspected
+        scanfind inspect shop.e57 --design steel.ifc --allowed 0.01 --out inspected
 
     Parameters
     ----------
