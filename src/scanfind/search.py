@@ -29,8 +29,8 @@ LEARNT = 0.5
 LEAST_POOL, MOST_POOL = 20_000, 60_000
 ROUNDS_A_POOL = 4  # draw from mostly the same cells, which are fitted then; small parts need others in the long run
 # The first round tells how easily an instance is found, and often finds all there is. Rounds after it: a little more
-# than is missing, and enough to be worth refining.
-FIRST_ROUND, ROUND_MARGIN, LEAST_ROUND = 0.3, 1.1, 0.15
+# than is missing, and enough to be worth refining; rather a little more in one round than two.
+FIRST_ROUND, ROUND_MARGIN, LEAST_ROUND, MOST_ROUND = 0.3, 1.1, 0.15, 1.3
 # With so many scanner positions nearly every sample faces one, and asking costs more than it tells.
 FACING_ORIGINS = 6
 SHAPED = 1000  # samples whose shape tells that of a model, each against all of them
@@ -314,7 +314,7 @@ class Search:
         if missed == 1.0:
             return 1.0
         needed = self.effort * (log(allowed) / log(missed) - 1.0)
-        return min(1.0, max(LEAST_ROUND, ROUND_MARGIN * needed))
+        return min(MOST_ROUND, max(LEAST_ROUND, ROUND_MARGIN * needed))
 
     def learn(self, model: int, hits: int, support: float) -> None:
         """Learn from an instance how often the last round hit it: pairs on it go with the square of what it shows."""
