@@ -70,6 +70,8 @@ class Sizes:
 
     def finest_cell(self) -> float:
         """The edge of the cells that the raw points are summed in, metres."""
+        if self._parameters.grid.cell_m is not None:
+            return self._parameters.grid.cell_m
         largest, *smaller = ([model.diameter for model in size.models] for size in self.groups())
         needed = [min(diameters) / CELLS_ACROSS_SMALLER for diameters in smaller]
         return min([first_cell(largest, self._parameters.grid), *needed])
