@@ -28,7 +28,6 @@ Floats = NDArray[np.float64]
 
 INSTALLED, UNCERTAIN, OCCLUDED = "installed", "uncertain", "occluded"
 NOT_FOUND, NOT_ENOUGH_DATA, NO_DATA = "not_found", "not_enough_data", "no_data"
-STATUSES = (INSTALLED, UNCERTAIN, OCCLUDED, NOT_FOUND, NOT_ENOUGH_DATA, NO_DATA)
 
 # Of the surface that beams went to from the stations: below the first nothing was there to look with; below the second
 # what was looked at is too little to call the rest missing.
@@ -48,7 +47,7 @@ class Element:
     """One product of the design, and what the scans say of it.
 
     placement : its GlobalId, class, name, and where the design puts it, in the scans' frame; model : of which geometry
-    status : one of STATUSES
+    status : one of those above
     detection : the id of the instance that is taken for it, or stands far off and may be it
     shift_m : (3,) of its middle from where the design puts it, in the scans' axes; turn_rad : by what angle it is
         turned, symmetry not counted; off_m : how far the point of its surface that moved the most did. None without

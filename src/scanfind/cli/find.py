@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from scanfind.cli.options import Count, Flag, Format, Metres, Names, Paths, Position, Seconds, Units, note, say
+from scanfind.cli.outputs import NOT_AS_WANTED, results_of
 from scanfind.errors import UsageError
 
 if TYPE_CHECKING:
     from scanfind.schema import Results
-
-NOT_FOUND = 3
 
 
 def find(
@@ -105,11 +104,10 @@ def find(
 
     from scanfind.cli.inputs import open_models
     from scanfind.config import load_settings
-    from scanfind.document import document, model_entries
     from scanfind.find import find as find_models
     from scanfind.parameters import PRESETS
     from scanfind.progress import progress_on
-    from scanfind.results import fill_folder, open_remainder, result_folder
+    from scanfind.results import open_remainder, result_folder
 
     flags = {
         "preset": preset, "seed": seed, "jobs": jobs, "units": units, "origin": origin, "format": format,
@@ -127,16 +125,10 @@ def find(
             scans, models, parameters=parameters, seed=run.seed, jobs=run.jobs, origin=run.origin,
             progress=progress, remainder=sink,
         )  # fmt: skip
-        if folder is None:
-            results = document(findings, models=model_entries(models), parameters=parameters, seed=run.seed)
-        else:
-            results = fill_folder(
-                folder, findings, models=models, parameters=parameters, seed=run.seed, format=run.format,
-                remainder=rest.name if rest else None, progress=progress,
-            )  # fmt: skip
+        results = results_of(findings, folder, models, run, parameters, progress, remainder=rest.name if rest else None)
     report(results, out, json=json)
     missing = {entry.name for entry in results.models} - {found.model for found in results.detections}
-    return NOT_FOUND if fail_on == "not-found" and missing else 0
+    return NOT_AS_WANTED if fail_on == "not-found" and missing else 0
 
 
 def report(results: Results, out: Path | None, *, json: bool) -> None:

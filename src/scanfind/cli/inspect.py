@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from scanfind.cli.options import Count, Flag, Format, Metres, Names, Paths, Position, Seconds, Units, note, say
+from scanfind.cli.outputs import NOT_AS_WANTED, results_of
 from scanfind.errors import UsageError
 
 if TYPE_CHECKING:
     from scanfind.schema import Results
-
-FAILED = 3
 
 
 def inspect(
@@ -90,11 +89,10 @@ def inspect(
 
     from scanfind.cli.inputs import open_models
     from scanfind.config import load_settings
-    from scanfind.document import document, model_entries
     from scanfind.find import find
     from scanfind.parameters import PRESETS
     from scanfind.progress import progress_on
-    from scanfind.results import fill_folder, result_folder
+    from scanfind.results import result_folder
 
     flags = {
         "seed": seed, "jobs": jobs, "units": units, "origin": origin, "format": format, "select": select,
@@ -110,15 +108,9 @@ def inspect(
             progress=progress, at_design=True,
         )  # fmt: skip
         findings.allowed_m = allowed
-        if folder is None:
-            results = document(findings, models=model_entries(models), parameters=parameters, seed=run.seed)
-        else:
-            results = fill_folder(
-                folder, findings, models=models, parameters=parameters, seed=run.seed, format=run.format,
-                progress=progress,
-            )  # fmt: skip
+        results = results_of(findings, folder, models, run, parameters, progress)
     report(results, out, json=json)
-    return FAILED if fail_on and failed(results, fail_on) else 0
+    return NOT_AS_WANTED if fail_on and failed(results, fail_on) else 0
 
 
 def report(results: Results, out: Path | None, *, json: bool) -> None:
