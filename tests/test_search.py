@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from scanfind.cloud import PointChunk
+from scanfind.draws import bin_pool, wald_table
 from scanfind.kernels.blocks import find_block, pack_block
 from scanfind.kernels.search import draw_firsts, draw_seconds, normal_bit
 from scanfind.moments import MomentGrid
 from scanfind.scene import orientation_grid
-from scanfind.search import bin_pool, wald_table
 from scanfind.self_similar import cube_turns
 from scanfind.surfels import Surfels
 from scanfind.threads import in_threads

@@ -16,6 +16,7 @@ import naive
 from scanfind.cloud import CloudModel, PointChunk
 from scanfind.depth import LEAST_SPOKEN, Beams, DepthMap, joined_until_spoken
 from scanfind.free_space import Limits, caster_of, spoken_of
+from scanfind.hypotheses import Hypotheses, model_arrays
 from scanfind.kernels.grid import AIM_UNITS, NO_BEAM, RANGE_UNITS, cube_pixel, cube_place, pack_beam, unpack_beam
 from scanfind.library import joint_table
 from scanfind.model import Model, ModelParameters, build_model
@@ -25,7 +26,6 @@ from scanfind.pose import Pose, random_rotation
 from scanfind.recognise import Candidate, Recognition
 from scanfind.refine import Refined
 from scanfind.scene import GridParameters, Scene, build_scene
-from scanfind.search import Hypotheses, model_arrays
 from scanfind.simulate.parts import blocks
 from scanfind.surface import SurfaceParameters
 from scanfind.verify import distinct, gather_support, spread

@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.recognition.parts import Part, library_of
 from benchmarks.recognition.trial import Trial
+from scanfind.hypotheses import Hypotheses
 from scanfind.library import joint_table
 from scanfind.model import Model
 from scanfind.moments import MomentGrid
@@ -16,7 +17,6 @@ from scanfind.parameters import PRESETS
 from scanfind.pose import Pose
 from scanfind.recognise import Recognition
 from scanfind.scene import build_scene, first_cell
-from scanfind.search import Hypotheses
 from scanfind.sources import Sources
 from scanfind.threads import available_cores
 from scanfind.verify import distances, outlines, why_refused

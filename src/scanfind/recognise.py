@@ -14,10 +14,11 @@ from scanfind.assembly import Assemblies, Explained, View
 from scanfind.detection import Detection, Motion, Refused
 from scanfind.elements import LEAST_LOOKED_AT, Element, elements_of, placements_of
 from scanfind.free_space import Limits, Spoken, caster_of, spoken_of
+from scanfind.hypotheses import Hypotheses, joined, model_arrays
 from scanfind.near_surface import signed_distances
 from scanfind.pose import Pose
 from scanfind.refine import Refined, covariance_of, held, icp, shrinking, triple, unobservable
-from scanfind.search import Hypotheses, Search, model_arrays
+from scanfind.search import Search
 from scanfind.verify import (
     Evidence,
     Level,
@@ -588,12 +589,6 @@ class Recognition:
             chance = self.search.chance_missed()
             told.append(f"the time limit ended the search; an instance may have been missed with chance {chance:.0%}")
         return told
-
-
-def joined(parts: Sequence[Hypotheses]) -> Hypotheses:
-    """Several lists of hypotheses as one."""
-    models, rotations, translations, support = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Hypotheses(models, rotations, translations, support)
 
 
 def closest(refused: list[tuple[Candidate, str]]) -> list[tuple[Candidate, str]]:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from scanfind.detection import Motion
 from scanfind.errors import require
+from scanfind.hypotheses import Hypotheses, ModelArrays
 from scanfind.pose import Pose, rotation_from_vector, rotation_vector
-from scanfind.search import Hypotheses, ModelArrays
 from scanfind.threads import in_threads
 
 if TYPE_CHECKING:

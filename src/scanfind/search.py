@@ -5,18 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import exp, log
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.cloud import OrientedCloud
+from scanfind.draws import Draws, Trial, affordable, wald_table
 from scanfind.errors import require
-from scanfind.moments import empty_hash
-from scanfind.pairs import rung_distance, rungs_of
+from scanfind.hypotheses import Hypotheses, no_hypotheses
+from scanfind.pairs import rungs_of
 from scanfind.scene import flatness_above
-from scanfind.threads import in_threads
 
 if TYPE_CHECKING:
+    from scanfind.hypotheses import ModelArrays
     from scanfind.library import JointTable
     from scanfind.model import Model
     from scanfind.scene import Scene
@@ -34,9 +36,6 @@ FIRST_ROUND, ROUND_MARGIN, LEAST_ROUND, MOST_ROUND = 0.3, 1.1, 0.15, 1.3
 # With so many scanner positions nearly every sample faces one, and asking costs more than it tells.
 FACING_ORIGINS = 6
 SHAPED = 1000  # samples whose shape tells that of a model, each against all of them
-PARTNERS_COUNTED = 40  # surfels whose partners are counted, each against all of the pool
-# Bins a pair distance: 1,600 of them make the shell a partner is sought in (kernels.search.draw_seconds).
-BINS_A_DISTANCE = 6
 # Borders between classes of bend, in shares of the window: range noise of 2 mm on a plane is below the first for
 # windows over 0.1 m, a pipe as wide as the window above the last.
 BEND_BORDERS = (0.02, 0.05, 0.1)
@@ -114,73 +113,6 @@ class SearchParameters:
             require(getattr(self, name) >= 1, name, getattr(self, name), "1 or more")
 
 
-class ModelArrays(NamedTuple):
-    """The samples of all models sought, end to end.
-
-    starts : (models+1,) int64, where each model's begin
-    points, normals : (N, 3), model frame, metres; samples : (N, 6) float32, both side by side
-    centres, radii : (models, 3), (models,) of the samples: their mean, and their root mean square distance from it
-    """
-
-    starts: NDArray[np.int64]
-    points: Floats
-    normals: Floats
-    samples: NDArray[np.float32]
-    centres: Floats
-    radii: Floats
-
-
-class Hypotheses(NamedTuple):
-    """H poses of models, the best first.
-
-    models : (H,) int64; rotations (H, 3, 3), translations (H, 3) : scene_from_model, relative to the grid's offset
-    support : (H,) share of the test's samples on the scene
-    """
-
-    models: NDArray[np.int64]
-    rotations: Floats
-    translations: Floats
-    support: Floats
-
-    def take(self, which: NDArray[np.intp]) -> Hypotheses:
-        """Some of them."""
-        return Hypotheses(self.models[which], self.rotations[which], self.translations[which], self.support[which])
-
-
-def model_arrays(models: Sequence[Model]) -> ModelArrays:
-    """Concatenate the models' samples."""
-    sizes = [len(model.samples) for model in models]
-    centres = np.array([model.samples.points.mean(axis=0) for model in models])
-    radii = np.array(
-        [
-            np.sqrt(((m.samples.points - centre) ** 2).sum(axis=1).mean())
-            for m, centre in zip(models, centres, strict=True)
-        ]
-    )
-    return ModelArrays(
-        np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
-        np.concatenate([m.samples.points for m in models]),
-        np.concatenate([m.samples.normals for m in models]),
-        np.concatenate([np.hstack([m.samples.points, m.samples.normals]) for m in models]).astype(np.float32),
-        centres, radii,
-    )  # fmt: skip
-
-
-def wald_table(tests: int, right: float, wrong: float, lost: float = 0.02) -> NDArray[np.int64]:
-    """Least hits after k = 0 … tests samples below which a hypothesis is given up (Wald's sequential test).
-
-    right, wrong : chance of a sample to lie on the scene under a right and a wrong hypothesis; lost : accepted chance
-    of giving up a right one.
-    """
-    right = max(right, 1.5 * wrong)
-    hit, miss = log(right / wrong), log((1.0 - right) / (1.0 - wrong))
-    k = np.arange(tests + 1)
-    least = np.ceil((log(lost) - k * miss) / (hit - miss)).clip(0)
-    # What is left at the end must have the overlap itself, less what chance does to a sample of this size.
-    least[-1] = max(least[-1], np.floor(tests * right - 2.0 * np.sqrt(tests * right * (1.0 - right))))
-    return np.asarray(least, np.int64)
-
-
 class Search:
     """The rounds of RANSAC over one scene, for all models together; the same seed gives the same rounds."""
 
@@ -200,13 +132,13 @@ class Search:
         self.model_shapes = np.array([model_shape(model, window) for model in models])
         # As far as two samples of a model may be off, but never less than the scene's own resampling.
         self._tolerance = max(scene.fine.cell, self.pairs.tolerance * min(model.spacing for model in models))
+        self._signed = scene.fine.signed and all(model.signed for model in models)
         self.rounds, self.effort, self._last_share = 0, 0.0, 1.0
         self.pool = np.empty(0, np.intp)
         self._fill_pool()
         self._expected = np.zeros(len(models))
         self._served = np.zeros(len(models), np.bool_)  # models of which no further instance is wanted
         self._learned = np.zeros((len(models), 2))  # hits, and what was shown, of the instances found
-        self._sides = 1 if scene.fine.signed and all(m.signed for m in models) else 4
         self._look_for(parameters.overlap_ratio)
 
     def _look_for(self, overlap_ratio: float) -> None:
@@ -249,10 +181,8 @@ class Search:
         surfels = surfels[fine.has_normal()[surfels]]
         self.pool = surfels[self._clean(surfels)]
         self._stale = False
-        self._bins = {
-            rung: bin_pool(self.pool, fine.means, rung_distance(rung, self.pairs), self._tolerance)
-            for rung in self.rungs
-        }
+        points = OrientedCloud(fine.means[self.pool], fine.normals[self.pool], self._signed)
+        self._draws = Draws(points, self.pairs, self.rungs, self._tolerance, self.jobs)
 
     def _clean(self, surfels: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Which surfels have a normal to rely on: flat but for noise, or among the flatter ones of their shape.
@@ -327,85 +257,24 @@ class Search:
 
     def round(self) -> Hypotheses:
         """One round: draw pairs, look them up, test their hypotheses; the best of each pair that pass, best first."""
-        from scanfind.kernels.search import test_pairs
-
         if self._stale:
             self._fill_pool()
         if len(self.pool) < 2:
-            return Hypotheses(np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0))
-        share = self._last_share = self._share()
-        first, second, signs, keys = self._telling_pairs(share)
-        count = len(first)
-        support, models = np.zeros(count), np.zeros(count, np.int64)
-        rotations, translations = np.empty((count, 3, 3)), np.empty((count, 3))
-        fine, tolerant, table, arrays = self.scene.fine, self.scene.tolerant, self.table, self.arrays
-
-        in_threads(
-            self.jobs, count,
-            lambda start, stop: test_pairs(
-                start, stop, first, second, signs, keys, fine.means, fine.normals,
-                table.offsets, table.model, table.first, table.second, arrays.starts, arrays.points, arrays.normals,
-                arrays.samples, self.parameters.normal_length_m, tolerant.cell, tolerant.hash_keys,
-                tolerant.hash_values, tolerant.occupied, tolerant.masks, self._least_hits, self._origins,
-                support, models, rotations, translations,
-            ),
-        )  # fmt: skip
+            return no_hypotheses()
+        limits, share = self.parameters, self._share()
+        count = round(share * limits.pairs_a_round / len(self.rungs))
+        drawn = self._draws.draw(count, self.seed, self.rounds, limits.max_tries)
+        # Three of four choices of sides are wrong: as many more hypotheses are tested for the same right pairs.
+        most = share * limits.hypotheses_a_round * self._draws.sides
+        tested = affordable(drawn, self.table, most, rarest_first=limits.telling_first)
+        self._expect(count, drawn.keys, tested.keys)
+        trial = Trial(
+            self.table, self.arrays, self.scene.tolerant, self._origins, self._least_hits, limits.normal_length_m
+        )
         self.rounds += 1
         self.effort += share
-        order = np.argsort(-support, kind="stable")[: np.count_nonzero(support)]
-        return Hypotheses(models[order], rotations[order], translations[order], support[order])
-
-    def _telling_pairs(self, share: float) -> tuple[NDArray[np.int64], ...]:
-        """Draw a round's pairs; of those the library knows, the most telling that the round can afford to test.
-
-        share : of a full round, 0 … 1
-        """
-        count = round(share * self.parameters.pairs_a_round / len(self.rungs))
-        columns = [self._draw(rung, count) for rung in self.rungs]
-        first, second, signs, keys = (np.concatenate(column) for column in zip(*columns, strict=True))
-        cost = (self.table.offsets[1:] - self.table.offsets[:-1])[keys]
-        known = cost > 0
-        common = np.bincount(keys, minlength=len(self.table.offsets) - 1)
-        order = np.flatnonzero(known)
-        if self.parameters.telling_first:
-            order = order[np.argsort(common[keys[order]], kind="stable")]
-        # Three of four choices of sides are wrong: as many more hypotheses are tested for the same right pairs.
-        most = share * self.parameters.hypotheses_a_round * self._sides
-        affordable = np.searchsorted(np.cumsum(cost[order]), most) + 1
-        order = order[:affordable]
-        self._expect(count, keys, keys[order])
-        return first[order], second[order], signs[order], keys[order]
-
-    def _draw(self, rung: int, count: int) -> tuple[NDArray[np.int64], ...]:
-        """Pairs of scene points at one rung's distance: first, second, signs, keys, those that met a second point."""
-        from scanfind.kernels.search import draw_firsts, draw_seconds, key_pairs
-
-        fine = self.scene.fine
-        bins, distance, stream = self._bins[rung], rung_distance(rung, self.pairs), self.rounds * 1024 + rung
-        first, second = np.empty(count, np.int64), np.empty(count, np.int64)
-        draw_firsts(self.seed, stream, len(bins.pool), first)
-        order = np.argsort(bins.bin_of[first], kind="stable")
-        in_threads(
-            self.jobs, count,
-            lambda start, stop: draw_seconds(
-                start, stop, order, first, self.seed, stream, bins.keys, bins.bin_of, bins.hash_keys,
-                bins.hash_values, bins.starts, bins.points, bins.shell, distance, self._tolerance,
-                self.parameters.max_tries, second,
-            ),
-        )  # fmt: skip
-        met = second >= 0
-        first, second = bins.pool[first[met]], bins.pool[second[met]]
-        # Where nobody knows a normal's side, each pair is looked up with all four choices of sides.
-        sides = self._sides
-        signs = np.repeat(np.arange(sides), len(first))
-        first, second = np.tile(first, sides), np.tile(second, sides)
-        keys = np.empty(len(first), np.int64)
-        key_pairs(
-            first, second, signs, fine.means, fine.normals, self.pairs.angle_cell(), self.pairs.angle_bins(), keys
-        )
-        pairs = keys >= 0
-        keys[pairs] += rung * self.pairs.cells_per_rung()
-        return first[pairs], second[pairs], signs[pairs], keys[pairs]
+        self._last_share = share
+        return trial.test(tested, self._draws.points, self.jobs)
 
     def _expect(self, drawn_here: int, drawn: NDArray[np.int64], tested: NDArray[np.int64]) -> None:
         """Add how many right pairs this round tested of an instance of each model that shows `overlap_ratio`.
@@ -427,68 +296,10 @@ class Search:
                     continue
                 # The share of its samples a pair's length away, as against all of the pool so far away.
                 shell = 2.0 * model.parameters.pairs.tolerance * model.spacing
-                partners = on_it * len(keys) / samples**2 * 2.0 * self._tolerance / shell
-                second_on_it = partners / max(self._partners(rung), partners, 1e-9)
+                partners = on_it * len(keys) / samples**2 * 2.0 * self._draws.tolerance / shell
+                second_on_it = partners / max(self._draws.partners(rung), partners, 1e-9)
                 right = drawn_here * first_on_it * second_on_it * float(share[keys].mean())
                 self._expected[number] += RIGHT_PAIR_FINDS * right
-
-    def _partners(self, rung: int) -> float:
-        """How many surfels of the pool lie at a rung's distance from one of them, on average."""
-        from scanfind.kernels.search import count_partners
-
-        bins = self._bins[rung]
-        if bins.partners < 0.0:
-            some = bins.points[:: max(1, len(bins.points) // PARTNERS_COUNTED)]
-            found = count_partners(some, bins.points, rung_distance(rung, self.pairs), self._tolerance)
-            self._bins[rung] = bins = bins._replace(partners=float(found))
-        return bins.partners
-
-
-class Bins(NamedTuple):
-    """The pool sorted into cubes of one edge: bin b holds pool[starts[b]:starts[b+1]].
-
-    pool : (W,) surfels; points : (W, 3) where they are, side by side; bin_of : (W,) the bin of each
-    keys : (bins,) packed coordinates; hash_keys, hash_values : from them to the bin
-    shell : (Q, 3) int64, from a bin to all those that may hold a point at the pair distance from one in it
-    partners : how many of the pool lie at the distance from one of them; -1 until counted (see Search)
-    """
-
-    pool: NDArray[np.intp]
-    points: Floats
-    bin_of: NDArray[np.int64]
-    keys: NDArray[np.int64]
-    hash_keys: NDArray[np.int64]
-    hash_values: NDArray[np.int32]
-    starts: NDArray[np.int64]
-    shell: NDArray[np.int64]
-    partners: float
-
-
-def bin_pool(pool: NDArray[np.intp], means: Floats, distance: float, tolerance: float) -> Bins:
-    """Sort surfels into cubes, BINS_A_DISTANCE of them a pair distance ± tolerance, metres."""
-    from scanfind.kernels.blocks import BIAS, fill_hash
-
-    points, edge = means[pool], distance / BINS_A_DISTANCE
-    x, y, z = (np.floor(points / edge).astype(np.int64) + BIAS).T
-    keys = (x << 40) | (y << 20) | z
-    order = np.argsort(keys, kind="stable")
-    bins, starts = np.unique(keys[order], return_index=True)
-    starts = np.append(starts, len(pool))
-    hash_keys, hash_values = empty_hash(len(bins))
-    fill_hash(bins, np.arange(len(bins)), hash_keys, hash_values)
-    return Bins(
-        pool[order], points[order], np.repeat(np.arange(len(bins)), np.diff(starts)), bins, hash_keys, hash_values,
-        starts, shell_of(distance / edge, tolerance / edge), -1.0,
-    )  # fmt: skip
-
-
-def shell_of(distance: float, tolerance: float) -> NDArray[np.int64]:
-    """Steps (Q, 3) between unit cubes that hold points at distance ± tolerance from one another."""
-    reach = int(np.ceil(distance + tolerance)) + 1
-    steps = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    nearest = np.linalg.norm(np.maximum(np.abs(steps) - 1, 0), axis=1)
-    farthest = np.linalg.norm(np.abs(steps) + 1, axis=1)
-    return np.asarray(steps[(nearest <= distance + tolerance) & (farthest >= distance - tolerance)])
 
 
 def shape_classes(bends: NDArray[np.floating], window: float) -> NDArray[np.int8]:

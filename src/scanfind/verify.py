@@ -19,8 +19,8 @@ from scanfind.threads import in_threads
 if TYPE_CHECKING:
     from scanfind.depth import DepthMap
     from scanfind.free_space import Spoken
+    from scanfind.hypotheses import Hypotheses, ModelArrays
     from scanfind.scene import Scene
-    from scanfind.search import Hypotheses, ModelArrays
     from scanfind.surfels import Surfels
 
 Floats = NDArray[np.float64]

@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.hypotheses import Hypotheses
 from scanfind.pose import Pose, nearest_rotation, rotation_from_vector, rotation_vector
-from scanfind.search import Hypotheses
 from scanfind.verify import Level, held_against, spread
 
 if TYPE_CHECKING:
     from scanfind.assembly.parameters import AssemblyParameters
     from scanfind.assembly.parts import Assembly, Joint
+    from scanfind.hypotheses import ModelArrays
     from scanfind.scene import Scene
-    from scanfind.search import ModelArrays
     from scanfind.verify import VerifyParameters
 
 Floats = NDArray[np.float64]

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.assembly.members import Labels, connected, members
+from scanfind.hypotheses import ModelArrays
 from scanfind.mesh import Mesh
 from scanfind.near_surface import near_triangles, signed_distances, weld
-from scanfind.search import ModelArrays
 from scanfind.surface import SurfaceParameters, random_points, sample_mesh
 
 Floats = NDArray[np.float64]
