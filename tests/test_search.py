@@ -181,7 +181,7 @@ def test_wald_keeps_the_right_and_ends_the_wrong_early(right: float, wrong: floa
 def test_a_surfel_marks_its_own_cell_and_those_along_its_normal(signed: bool) -> None:
     surfels = room()
     surfels.signed = signed
-    grid = orientation_grid(surfels, 0.1, 0.2)
+    grid = orientation_grid(surfels.oriented(), 0.1, 0.2)
     marked = 0
     for mean, normal in zip(surfels.means[::7], surfels.normals[::7], strict=True):
         if not normal.any():

@@ -152,7 +152,7 @@ def recognise(
     while found.wants_more(clock.elapsed("search", "refine", "verify") / size.patience):
         tell("search", size.progress(found.progress()), 1.0)
         with clock("search"):
-            hypotheses = found.search.round()  # 3.3, 3.4 Algorithm 2: draw, look up, pose, count support
+            hypotheses = found.round()  # 3.3, 3.4 Algorithm 2: draw, look up, pose, count support
         with clock("refine"):
             poses = found.refine(hypotheses)  # 3.4 post-ICP
         with clock("verify"):

@@ -15,6 +15,7 @@ from scanfind.detection import Detection, Motion, Refused
 from scanfind.elements import LEAST_LOOKED_AT, Element, elements_of, placements_of
 from scanfind.free_space import Limits, Spoken, caster_of, spoken_of
 from scanfind.hypotheses import Hypotheses, joined, model_arrays
+from scanfind.lines import LineSearch
 from scanfind.near_surface import signed_distances
 from scanfind.pose import Pose
 from scanfind.refine import Refined, covariance_of, held, icp, shrinking, triple, unobservable
@@ -108,6 +109,8 @@ class Recognition:
         fine, coarse = self.search.telling()
         inlier = parameters.verify.inlier_noises * scene.noise
         inliers = [inlier + parameters.verify.inlier_cells * level.cell for level in (scene.fine, scene.coarse)]
+        self._lines: LineSearch | None = None
+        self._seed = seed
         self._fine = Level(scene.fine, fine, ALL_SAMPLES, inliers[0])
         self._thin = Level(scene.coarse, coarse, ALL_SAMPLES, inliers[0])
         self._rough = Level(scene.coarse, coarse, parameters.refine.coarse_samples, inliers[1])
@@ -142,6 +145,17 @@ class Recognition:
             return False
         # With nothing to show, rather a longer search than an answer that the next seed contradicts.
         return not self.search.may_stop() or (not self.believed and self.search.look_deeper())
+
+    def round(self) -> Hypotheses:
+        """Hypotheses of one more round, best first: of pairs of surface; once, for models of which the first round of
+        these found nothing, of lines.
+        """
+        if self.parameters.search.by_lines and self._lines is None and self.search.rounds:
+            found = np.isin(np.arange(len(self.models)), [candidate.model for candidate in self.believed])
+            self._lines = LineSearch(self.scene, self.models, ~found, self.parameters.search, self._seed, self.jobs)
+            if self._lines:
+                return self._lines.round()
+        return self.search.round()
 
     def at_design(self) -> Iterator[Hypotheses]:
         """The poses the design gives, so many of each model at a time as one refinement takes.
@@ -277,9 +291,11 @@ class Recognition:
         support = gather_support(
             hypotheses, self.scene, self._fine, self._thin, self.arrays, self.signed, verify, self.jobs
         )  # fmt: skip
+        lines = self._lines.beyond_chance(hypotheses) if self._lines else np.zeros(len(support))
         found = []
-        for seen, number, rotation, translation in zip(support, *hypotheses[:3], strict=True):
-            found.append(Evidence(*seen[:-1], self._spoken_of(int(number), Pose(rotation, translation)), seen.claims))
+        for seen, on_lines, number, rotation, translation in zip(support, lines, *hypotheses[:3], strict=True):
+            spoken = self._spoken_of(int(number), Pose(rotation, translation))
+            found.append(Evidence(*seen[:-1], spoken, seen.claims, float(on_lines)))
         return found
 
     def _spoken_of(self, number: int, placed: Pose) -> Spoken:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.cloud import OrientedCloud
 from scanfind.depth import Beams, DepthMap, joined_until_spoken
 from scanfind.errors import require
 from scanfind.moments import MomentGrid, empty_hash
@@ -129,7 +130,7 @@ def build_scene(
     coarse = Surfels(half, parameters.min_neighbours, jobs).fit()
     around = Surfels(quarter, 1, jobs).fit()
     test_cell = max(diameter / test_cells_across, around.cell)
-    tolerant = orientation_grid(coarse, 0.5 * test_cell, test_cell)
+    tolerant = orientation_grid(coarse.oriented(), 0.5 * test_cell, test_cell)
     beams = grid.beams()
     depths = joined_until_spoken([of.ranges() for of in beams])
     return Scene(
@@ -180,8 +181,8 @@ def flatness_above(surfels: Surfels, levels: int, around: Surfels) -> NDArray[np
 SPREAD = np.radians(20.0)
 
 
-def orientation_grid(surfels: Surfels, reach: float, cell: float) -> OrientationGrid:
-    """Mark every surfel's direction in the cells it supports: where it is and up to `reach` metres along its normal."""
+def orientation_grid(of: OrientedCloud, reach: float, cell: float) -> OrientationGrid:
+    """Mark every point's direction in the cells it supports: where it is and up to `reach` metres along that."""
     from scanfind.kernels.blocks import fill_hash
     from scanfind.kernels.search import mark_orientations
 
@@ -191,10 +192,10 @@ def orientation_grid(surfels: Surfels, reach: float, cell: float) -> Orientation
     counts = np.zeros(2, np.int64)
     while True:
         at = mark_orientations(
-            surfels.means, surfels.normals, reach, cell, SPREAD, surfels.signed, hash_keys, hash_values, block_keys,
+            of.points, of.normals, reach, cell, SPREAD, of.signed, hash_keys, hash_values, block_keys,
             masks, counts,
         )  # fmt: skip
-        if at == len(surfels.means):
+        if at == len(of):
             masks = masks[: counts[0]]
             bits = np.packbits(masks != 0, axis=1, bitorder="little").view(np.uint64)
             return OrientationGrid(cell, hash_keys, hash_values, bits, masks)

@@ -70,6 +70,7 @@ class SearchParameters:
         cost of testing it, is one over how often the scene shows its feature
     each_once : of a model's pairs that its symmetry maps onto one another look up only one: a pipe's pairs are the same
         all around it, and so are the poses they lead to
+    by_lines : where nothing is found, look for a model of thin members by these, as lines (see lines)
     normal_length_m : of the normals in the four-point sets (the paper: 1); 0: its limit, the roll alone from normals
     max_tries : places tried for s2 before another s1 is drawn
     tests : model samples in the sequential test
@@ -89,6 +90,7 @@ class SearchParameters:
     by_shape: bool = True
     telling_first: bool = True
     each_once: bool = True
+    by_lines: bool = True
     normal_length_m: float = 0.0
     max_tries: int = 1000
     tests: int = 192

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.cloud import OrientedCloud
 from scanfind.moments import MomentGrid, empty_hash
 from scanfind.threads import in_threads
 
@@ -48,7 +49,8 @@ class Cells(NamedTuple):
 class Surfels:
     """A scene as oriented points in an addressable grid; S surfels so far in V cells.
 
-    cells : their addresses; signed : the normals point to the scanner; False where nobody knows their side
+    grid, cells : the moments they are fitted to, and the addresses of its cells
+    signed : the normals point to the scanner; False where nobody knows their side
     first_surfel, sides : by a cell's row, its surfels: none where it was not fitted yet, else one, or two where
         scanners saw both faces of something thin
     cell_of : (S,) the cell each surfel lies in
@@ -58,7 +60,7 @@ class Surfels:
         """No surfel fitted yet. min_neighbours : see GridParameters; jobs : threads, on which nothing depends."""
         self.cells = number(grid, jobs)
         self.signed = grid.signed
-        self._grid, self._min_neighbours, self._jobs = grid, min_neighbours, jobs
+        self.grid, self._min_neighbours, self._jobs = grid, min_neighbours, jobs
         rows = grid.rows_end()
         self.first_surfel, self.sides = np.zeros(rows, np.int32), np.zeros(rows, np.uint8)
         self.cell_of = np.empty(0, np.int32)
@@ -92,6 +94,10 @@ class Surfels:
     def __len__(self) -> int:
         return len(self._faces)
 
+    def oriented(self) -> OrientedCloud:
+        """Means and normals of those fitted so far."""
+        return OrientedCloud(self.means, self.normals, self.signed)
+
     def fit(self, cells: NDArray[np.integer] | NDArray[np.bool_] | None = None) -> Surfels:
         """Fit those of some cells that are not fitted yet, all of them by default; itself, for chaining.
 
@@ -99,7 +105,7 @@ class Surfels:
         """
         from scanfind.kernels.surfels import fit_cells
 
-        at, grid = self.cells, self._grid
+        at, grid = self.cells, self.grid
         wanted = np.zeros(len(at), np.bool_)
         wanted[slice(None) if cells is None else cells] = True
         some = np.flatnonzero(wanted)

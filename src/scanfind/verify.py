@@ -94,6 +94,7 @@ class Evidence(NamedTuple):
     rms : of the supported samples' distances to the scene, metres
     spoken : what the beams say of the surface
     claims : surfels that support it, ascending
+    lines : of its lines, how much lies on the scene's beyond chance (lines.LineSearch); 0 where these were not asked
     """
 
     samples: int
@@ -102,6 +103,7 @@ class Evidence(NamedTuple):
     rms: float
     spoken: Spoken
     claims: NDArray[np.intp]
+    lines: float = 0.0
 
     def support(self) -> float:
         """The paper's λs."""
@@ -132,7 +134,7 @@ def score(evidence: Evidence, blind: bool, parameters: VerifyParameters, *, in_p
         return on / weighed if weighed else 0.0
     # Few supported samples can agree by chance: the visible share is believed as far as their number goes. More than
     # half of a part lies on no floor or wall, whatever its shape tells: where a scan shows it alone, nothing tells.
-    believed = evidence.telling + max(0.0, evidence.support() - 0.5)
+    believed = evidence.telling + max(0.0, evidence.support() - 0.5) + evidence.lines
     return (on / weighed if weighed else 0.0) * float(1.0 - np.exp(-believed / BELIEVED_SUPPORT))
 
 

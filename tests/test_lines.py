@@ -1,0 +1,175 @@
+"""Thin members as lines: what is fitted to a window, who has lines, and that a sparse frame is found by them."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise, product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from scanfind.cloud import OrientedCloud, PointChunk, PointCloud
+from scanfind.find import find
+from scanfind.hypotheses import Hypotheses
+from scanfind.kernels.blocks import unpack_block
+from scanfind.kernels.lines import fit_lines, lines_of_samples
+from scanfind.lines import LEAST_CELLS, REACH, LineSearch, beside, frames, level_of
+from scanfind.model import Model, ModelParameters, build_model
+from scanfind.moments import MomentGrid
+from scanfind.parameters import PRESETS, Parameters
+from scanfind.pose import Pose, random_rotation
+from scanfind.scene import Scene, build_scene
+from scanfind.simulate.objects import FRAME_SIZE_M, box_frame
+from scanfind.simulate.parts import blocks
+from scanfind.surface import SurfaceParameters, random_points
+from scanfind.surfels import number
+
+Floats = NDArray[np.float64]
+
+TRUTH = Pose.from_rotation_vector([0.02, -0.03, 0.7], [4.0, 1.0, 0.05])
+SCANNER = np.array([-3.0, -4.0, 1.6])
+WITHOUT = replace(PRESETS["default"], search=replace(PRESETS["default"].search, by_lines=False))
+
+
+@cache
+def frame() -> Model:
+    return build_model(box_frame())
+
+
+@cache
+def sparse_hall() -> Floats:
+    """(N, 3): a frame with 300 points on what a scanner sees of it, on a floor, between two walls and among crates."""
+    rng = np.random.default_rng(3)
+    points, normals = random_points(box_frame(), 2400, rng)
+    points, normals = TRUTH.move(points), normals @ TRUTH.rotation.T
+    seen = points[((SCANNER - points) * normals).sum(axis=1) > 0.0][:300]
+    floor = np.column_stack([rng.uniform(-4, 10, (4000, 1)), rng.uniform(-5, 7, (4000, 1)), np.full(4000, 0.0)])
+    walls = [np.column_stack([np.full(1500, 10.0), rng.uniform(-5, 7, 1500), rng.uniform(0, 3, 1500)]),
+             np.column_stack([rng.uniform(-4, 10, 1500), np.full(1500, 7.0), rng.uniform(0, 3, 1500)])]  # fmt: skip
+    crates = [at + rng.uniform(0, 0.8, (200, 3)) for at in ([1.0, -3.0, 0.0], [-2.0, 3.0, 0.0], [8.0, -2.0, 0.0])]
+    return np.concatenate([seen, floor, *walls, *crates]) + rng.normal(scale=0.002, size=(300 + 7000 + 600, 3))
+
+
+@cache
+def hall_scene() -> Scene:
+    grid = MomentGrid(frame().diameter / 180.0, np.zeros(3))
+    points = sparse_hall()
+    grid.add(PointChunk(points, {}, np.arange(len(points)), origin=SCANNER))
+    return build_scene(grid, frame().diameter, Parameters().grid, Parameters().search.test_cells_across, 1)
+
+
+def by_eigh(points: Floats) -> tuple[Floats, Floats, float]:
+    """Mean, direction of the largest spread, and one less second over largest, the plain way."""
+    values, vectors = np.linalg.eigh(np.cov(points.T, bias=True))
+    return points.mean(axis=0), vectors[:, 2], float(1.0 - values[1] / values[2])
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**31))
+def test_the_line_of_a_window_is_what_eigenvectors_say(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(60, 3)) @ (random_rotation(rng) * [0.2, 0.05, 0.02]) + rng.uniform(-5, 5, 3)
+    lines = np.empty((5, 7))
+    lines_of_samples(points, 0.3, 5, lines)
+    for at, line in zip(points, lines, strict=False):
+        near = points[np.linalg.norm(points - at, axis=1) <= 0.3]
+        if len(near) < 4:
+            continue
+        mean, along, linear = by_eigh(near)
+        np.testing.assert_allclose(line[:3], mean, atol=1e-9)
+        assert abs(line[3:6] @ along) == pytest.approx(1.0, abs=1e-6)
+        assert line[6] == pytest.approx(linear, abs=1e-9)
+
+
+@settings(deadline=None, max_examples=8)
+@given(st.integers(0, 2**31))
+def test_the_lines_of_a_grid_are_those_of_its_cells_each_counted_once(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    cell, points = 0.25, rng.uniform(-1.5, 1.5, (150, 3))
+    grid = MomentGrid(cell, np.zeros(3))
+    grid.add(PointChunk(points, {}, np.arange(150), origin=None))
+    cells = number(grid, 1)
+    lines = np.empty((len(cells), 7))
+    fit_lines(
+        0, len(cells.order), cells.first_cell, cells.locals, cells.order, cells.block_keys, cells.hash_keys,
+        cells.hash_values, cells.block_rows, grid.moments, grid.links, cell, grid.units, REACH, LEAST_CELLS, lines,
+    )  # fmt: skip
+    members: dict[tuple[int, ...], list[int]] = defaultdict(list)
+    for k, where in enumerate(np.floor(points / cell).astype(int).tolist()):
+        members[tuple(where)].append(k)
+    steps = [step for step in product(range(-3, 4), repeat=3) if np.dot(step, step) <= REACH**2]
+    for block, (first, end) in enumerate(pairwise(cells.first_cell.tolist())):
+        corner = 8 * np.array(unpack_block(cells.block_keys[cells.order[block]]))
+        for cell_at in range(first, end):
+            local = int(cells.locals[cell_at])
+            where = corner + np.array([local >> 6, local >> 3 & 7, local & 7])
+            near = [points[members[to]] for step in steps if (to := tuple((where + step).tolist())) in members]
+            if len(near) < LEAST_CELLS:
+                assert not lines[cell_at].any()
+                continue
+            weights = np.concatenate([np.full(len(some), 1.0 / len(some)) for some in near])
+            pooled = np.concatenate(near)
+            values = np.linalg.eigvalsh(np.cov(pooled.T, bias=True, aweights=weights))
+            # Points lie on a lattice of a 4096th of a cell.
+            np.testing.assert_allclose(lines[cell_at, :3], np.average(pooled, axis=0, weights=weights), atol=1e-4)
+            assert lines[cell_at, 6] == pytest.approx(1.0 - values[1] / values[2], abs=5e-3)
+
+
+@given(st.integers(0, 2**31))
+def test_frames_take_z_to_their_direction_and_lines_move_across_themselves(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    directions = rng.normal(size=(7, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    turned = frames(directions, rng.uniform(0, 7, 7))
+    np.testing.assert_allclose(turned @ turned.transpose(0, 2, 1), np.broadcast_to(np.eye(3), (7, 3, 3)), atol=1e-12)
+    np.testing.assert_allclose(turned[:, :, 2], directions, atol=1e-12)
+    assert np.linalg.det(turned) == pytest.approx(1.0)
+    lines = OrientedCloud(rng.normal(size=(7, 3)), directions, signed=False)
+    moved = beside(lines, 0.3).points.reshape(5, 7, 3) - lines.points
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=2), np.outer([0, 0.3, 0.3, 0.3, 0.3], np.ones(7)), atol=1e-12)
+    np.testing.assert_allclose((moved * directions).sum(axis=2), 0.0, atol=1e-12)
+
+
+def test_a_frame_has_lines_and_a_block_has_none() -> None:
+    level = level_of(frame(), frame().diameter / 180.0)
+    assert level is not None
+    # Of members of 100 mm: a window of two to five widths across.
+    assert 0.1 < REACH * frame().diameter / 180.0 * 2.0**level < 0.25
+    few = ModelParameters(SurfaceParameters(samples=600))
+    block = build_model(blocks("block", [((0.0, 0.0, 0.0), (1.0, 0.7, 0.5))]), few)
+    assert level_of(block, block.diameter / 180.0) is None
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_lines_tell_the_right_pose_from_any_other_on_any_number_of_threads(jobs: int) -> None:
+    scene, rng = hall_scene(), np.random.default_rng(0)
+    lines = LineSearch(scene, [frame()], np.ones(1, np.bool_), Parameters().search, 0, jobs)
+    offset = scene.fine.cells.offset
+    turns = np.array([TRUTH.rotation, *(random_rotation(rng) for _ in range(50))])
+    places = np.array([TRUTH.translation, *(rng.uniform(0, 4, (50, 3)))]) - offset
+    told = lines.beyond_chance(Hypotheses(np.zeros(51, np.int64), turns, places, np.ones(51)))
+    assert told[0] > 0.2
+    assert told[1:].max() < 0.05
+    first, again = lines.round(), LineSearch(scene, [frame()], np.ones(1, np.bool_), Parameters().search, 0, 1).round()
+    np.testing.assert_array_equal(first.translations, again.translations)
+    # Turned over, a frame's lines lie on one another but for its brace: one of the best is right.
+    traces = np.einsum("kij,ij->k", first.rotations[:50], TRUTH.rotation)
+    assert traces.max() > 1.0 + 2.0 * np.cos(np.radians(10.0))
+
+
+def test_what_is_found_already_is_not_looked_for_by_lines() -> None:
+    assert not LineSearch(hall_scene(), [frame()], np.zeros(1, np.bool_), Parameters().search, 0, 1)
+
+
+def test_a_frame_without_normals_is_found_by_its_lines_only() -> None:
+    hall = PointCloud(sparse_hall(), origin=SCANNER)
+    found = find(hall, box_frame(), isolate=False)
+    assert len(found) == 1
+    middle = np.array(FRAME_SIZE_M) / 2.0
+    assert np.linalg.norm(found[0].scene_from_model.move(middle[None]) - TRUTH.move(middle[None])) < 0.01
+    assert not find(hall, box_frame(), parameters=WITHOUT, isolate=False)
