@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from scanfind.cloud import OrientedCloud, PointChunk, PointCloud
+from scanfind.cloud import OrientedCloud, PointChunk
 from scanfind.find import find
 from scanfind.hypotheses import Hypotheses
 from scanfind.kernels.blocks import unpack_block
@@ -24,15 +24,19 @@ from scanfind.moments import MomentGrid
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.pose import Pose, random_rotation
 from scanfind.scene import Scene, build_scene
+from scanfind.simulate.instruments import Scanner
 from scanfind.simulate.objects import FRAME_SIZE_M, box_frame
 from scanfind.simulate.parts import blocks
-from scanfind.surface import SurfaceParameters, random_points
+from scanfind.simulate.scanner import SimulatedScan, scan
+from scanfind.simulate.scene import Scene as SimulatedScene
+from scanfind.simulate.scene import SceneObject
+from scanfind.surface import SurfaceParameters
 from scanfind.surfels import number
 
 Floats = NDArray[np.float64]
 
-TRUTH = Pose.from_rotation_vector([0.02, -0.03, 0.7], [4.0, 1.0, 0.05])
-SCANNER = np.array([-3.0, -4.0, 1.6])
+TRUTH = Pose.from_rotation_vector([0.0, 0.0, 0.7], [1.0, 0.5, 0.02])
+STATIONS = [[-3.0, -4.0, 1.6], [6.0, -3.0, 1.7]]
 WITHOUT = replace(PRESETS["default"], search=replace(PRESETS["default"].search, by_lines=False))
 
 
@@ -42,24 +46,19 @@ def frame() -> Model:
 
 
 @cache
-def sparse_hall() -> Floats:
-    """(N, 3): a frame with 300 points on what a scanner sees of it, on a floor, between two walls and among crates."""
-    rng = np.random.default_rng(3)
-    points, normals = random_points(box_frame(), 2400, rng)
-    points, normals = TRUTH.move(points), normals @ TRUTH.rotation.T
-    seen = points[((SCANNER - points) * normals).sum(axis=1) > 0.0][:300]
-    floor = np.column_stack([rng.uniform(-4, 10, (4000, 1)), rng.uniform(-5, 7, (4000, 1)), np.full(4000, 0.0)])
-    walls = [np.column_stack([np.full(1500, 10.0), rng.uniform(-5, 7, 1500), rng.uniform(0, 3, 1500)]),
-             np.column_stack([rng.uniform(-4, 10, 1500), np.full(1500, 7.0), rng.uniform(0, 3, 1500)])]  # fmt: skip
-    crates = [at + rng.uniform(0, 0.8, (200, 3)) for at in ([1.0, -3.0, 0.0], [-2.0, 3.0, 0.0], [8.0, -2.0, 0.0])]
-    return np.concatenate([seen, floor, *walls, *crates]) + rng.normal(scale=0.002, size=(300 + 7000 + 600, 3))
+def sparse_hall() -> SimulatedScan:
+    """A frame with 300 points on it, on the floor of a room and among crates: 60 mm between them, 100 mm members."""
+    crates = [((x, y, 0.0), (x + 0.8, y + 0.6, 0.7)) for x, y in ((-1.0, -3.0), (-3.0, 3.0), (6.0, -1.5))]
+    room = blocks("room", [((-5.0, -6.0, -0.1), (9.0, 7.0, 0.0)), ((-5.0, 7.0, 0.0), (9.0, 7.1, 3.0)), *crates])
+    things = (SceneObject("room", room, Pose.identity()), SceneObject("frame", box_frame(), TRUTH, target=True))
+    return scan(SimulatedScene(things, np.array(STATIONS)), scanner=Scanner(), seed=3, points=40_000)
 
 
 @cache
 def hall_scene() -> Scene:
     grid = MomentGrid(frame().diameter / 180.0, np.zeros(3))
-    points = sparse_hall()
-    grid.add(PointChunk(points, {}, np.arange(len(points)), origin=SCANNER))
+    for cloud in sparse_hall().stations:
+        grid.add(PointChunk(cloud.xyz, {}, np.arange(len(cloud)), origin=cloud.origin))
     return build_scene(grid, frame().diameter, Parameters().grid, Parameters().search.test_cells_across, 1)
 
 
@@ -167,7 +166,7 @@ def test_what_is_found_already_is_not_looked_for_by_lines() -> None:
 
 
 def test_a_frame_without_normals_is_found_by_its_lines_only() -> None:
-    hall = PointCloud(sparse_hall(), origin=SCANNER)
+    hall = sparse_hall().stations
     found = find(hall, box_frame(), isolate=False)
     assert len(found) == 1
     middle = np.array(FRAME_SIZE_M) / 2.0

@@ -101,6 +101,10 @@ class Towards(NamedTuple):
     ranges: Floats
     angles: Floats
 
+    def ends(self) -> Floats:
+        """Where they ended, (B, 3)."""
+        return self.origins + self.directions * self.ranges[:, None]
+
 
 def towards(model: Model, placed: Pose, scanners: Sequence[Beams]) -> Towards:
     """The beams that go towards a placed model, MOST_BEAMS of them where there are more."""

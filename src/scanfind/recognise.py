@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from math import ceil, log
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from scanfind.assembly import Assemblies, Explained, View
 from scanfind.detection import Detection, Motion, Refused
 from scanfind.elements import LEAST_LOOKED_AT, Element, elements_of, placements_of
-from scanfind.free_space import Limits, Spoken, caster_of, spoken_of
+from scanfind.free_space import Limits, Spoken, caster_of, spoken_of, towards
 from scanfind.hypotheses import Hypotheses, joined, model_arrays
 from scanfind.lines import LineSearch
-from scanfind.near_surface import signed_distances
+from scanfind.near_surface import near_model, signed_distances
+from scanfind.polish import polish
 from scanfind.pose import Pose
 from scanfind.refine import Refined, covariance_of, held, icp, shrinking, triple, unobservable
 from scanfind.search import Search
@@ -62,6 +63,7 @@ WEARY = 12  # poses of a model tried in parts, from which on only what comes clo
 DRAWN_IN_CELLS = (2.0, 0.75)  # of the largest: how far off its design an element is met at once …
 FARTHER_IF = 1.2  # … where so many more of its samples meet the scan there than about the design
 IN_PLACE_M = 0.06  # what ICP carried no farther off is still where the design puts it
+ON_BEAMS_CELLS, ON_BEAMS_STEPS = 1.5, 2  # how near the surface beams end that a pose is fitted to, and how often
 REFUSED_SHOWN = 3  # of each model: what came closest
 
 
@@ -127,6 +129,7 @@ class Recognition:
         self._the_same = diameters / 1000.0
         self._drawn_in = diameters / 10.0
         self._casters: dict[int, RayCaster] = {}
+        self._near: dict[int, NearSurface] = {}
         view = View(scene, self._fine, self._thin, self.signed, parameters.verify)
         self._assemblies = Assemblies(models, view, parameters.assembly, self.blind)
         self._tried_in_parts: list[Candidate] = []
@@ -197,6 +200,8 @@ class Recognition:
         better = met.take(np.argsort(-np.concatenate([r.matched for r in rough]), kind="stable"))
         better = better.take(distinct(better, self.arrays, self._apart_after, kept, 2 * kept))
         fine = self._icp_fine(better.take(self._promising(better, REFUSED_SHOWN)))
+        if self._lines:
+            fine = self._on_beams(fine, self._lines.beyond_chance(fine.hypotheses) > 0.0)
         fine = fine.take(np.argsort(-fine.matched, kind="stable"))
         # What ended at one place is asked once.
         return fine.take(distinct(fine.hypotheses, self.arrays, self._the_same, kept, 2 * kept))
@@ -219,6 +224,25 @@ class Recognition:
             found.hypotheses.rotations[k], found.hypotheses.translations[k] = pose.rotation, pose.translation
         both = joined([hypotheses, found.hypotheses])
         return Refined(both, np.tile(found.hessians, (2, 1, 1)), np.tile(found.matched, 2), np.tile(found.rms, 2))
+
+    def _on_beams(self, refined: Refined, some: NDArray[np.bool_]) -> Refined:
+        """Refined poses, some of them (H,) fitted to where beams ended that went towards them.
+
+        Where cells are too empty for normals ICP ends within half a cell; held against the model's own faces the beams
+        themselves bring that to a millimetre, in ten milliseconds.
+        """
+        found = refined.hypotheses
+        for k in np.flatnonzero(some):
+            number = int(found.models[k])
+            if number not in self._near:
+                self._near[number] = near_model(self.models[number], ON_BEAMS_CELLS * self.scene.fine.cell)
+            pose = Pose(found.rotations[k], found.translations[k])
+            for _ in range(ON_BEAMS_STEPS):
+                ends = towards(self.models[number], pose, self.scene.beams).ends()
+                fitted = polish(self._near[number], pose, ends, np.zeros(len(ends), np.int64), self.parameters.refine)
+                pose = fitted.scene_from_model if fitted else pose
+            found.rotations[k], found.translations[k] = pose.rotation, pose.translation
+        return refined
 
     def _promising(self, hypotheses: Hypotheses, shown: int) -> NDArray[np.intp]:
         """Those whose evidence on the coarse surfels is not hopeless, and the best `shown` of each model (indices)."""
@@ -449,7 +473,12 @@ class Recognition:
 
     def _claim(self, candidate: Candidate, claimed: NDArray[np.bool_]) -> None:
         """Mark the cells a pose claims: its samples are too few to name every cell of its surface themselves."""
-        self._mark(self.scene.fine.means[candidate.evidence.claims], CLAIM_CELLS, claimed)
+        claims = candidate.evidence.claims
+        if len(claims):
+            self._mark(self.scene.fine.means[claims], CLAIM_CELLS, claimed)
+        else:  # so sparse that coarse cells and lines speak alone
+            samples = self.models[candidate.model].samples.points
+            self._mark(samples @ candidate.rotation.T + candidate.translation, CLAIM_CELLS, claimed)
 
     def _mark(self, points: Floats, reach: int, marked: NDArray[np.bool_]) -> None:
         """Mark the rows of the fine cells up to `reach` cells from points (N, 3)."""
@@ -479,8 +508,13 @@ class Recognition:
 
     def _shares(self, candidate: Candidate, claimed: NDArray[np.bool_]) -> bool:
         """Is too much of what supports a pose claimed by others already?"""
-        claims = self.scene.fine.cells.rows[self.scene.fine.cell_of[candidate.evidence.claims]]
-        return bool(claimed[claims].mean() > self.parameters.verify.shared) if len(claims) else True
+        claims: NDArray[Any] = self.scene.fine.cells.rows[self.scene.fine.cell_of[candidate.evidence.claims]]
+        if not len(claims):
+            claims = self._no_rows()
+            self._claim(candidate, claims)
+            if not claims.any():
+                return True
+        return bool(claimed[claims].mean() > self.parameters.verify.shared)
 
     def _stands_elsewhere(self, candidate: Candidate) -> bool:
         """Does too much of what supports a pose belong to an instance of a larger model?"""

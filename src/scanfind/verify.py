@@ -149,7 +149,7 @@ def rough_score(rough: Rough, blind: bool) -> float:
 def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters, *, in_place: bool = False) -> str:
     """Why a pose is not believed, in words; empty where it is. in_place : see `score`."""
     least = parameters.min_support_blind if blind else parameters.min_support
-    if evidence.support() < least:
+    if max(evidence.support(), evidence.lines) < least:
         return f"only {evidence.support():.0%} of its surface lies on the scan, {least:.0%} is asked for"
     if score(evidence, blind, parameters, in_place=in_place) >= parameters.min_score:
         return ""
