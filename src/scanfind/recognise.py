@@ -28,6 +28,7 @@ from scanfind.verify import (
     distinct,
     gather_rough,
     gather_support,
+    nearest,
     outlines,
     rough_score,
     score,
@@ -258,10 +259,10 @@ class Recognition:
     def _far_from(self, hypotheses: Hypotheses, met: Hypotheses) -> NDArray[np.intp]:
         """The hypotheses that would not be drawn to where those in `met` went already (indices)."""
         theirs, placed = outlines(met, self.arrays), outlines(hypotheses, self.arrays)
-        far = [
-            not (distances(placed[k], theirs[met.models == model]) < self._drawn_in[model]).any()
-            for k, model in enumerate(hypotheses.models)
-        ]
+        far = np.ones(len(placed), np.bool_)
+        for model in np.unique(hypotheses.models):
+            mine = hypotheses.models == model
+            far[mine] = nearest(placed[mine], theirs[met.models == model]) >= self._drawn_in[model]
         return np.flatnonzero(far)
 
     def _icp_coarse(self, hypotheses: Hypotheses) -> Refined:
@@ -496,7 +497,7 @@ class Recognition:
         poses = [placed @ motion for motion in motions]
         theirs = outlines(self._placements(found.model, poses), self.arrays)
         mine = outlines(hypotheses.take(np.flatnonzero(hypotheses.models == found.model)), self.arrays)
-        return sum(bool((distances(one, theirs) < self._drawn_in[found.model]).any()) for one in mine)
+        return int(np.count_nonzero(nearest(mine, theirs) < self._drawn_in[found.model]))
 
     def _placements(self, model: int, poses: Sequence[Pose]) -> Hypotheses:
         """Poses of one model as hypotheses."""

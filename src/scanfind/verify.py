@@ -339,3 +339,11 @@ def outlines(hypotheses: Hypotheses, arrays: ModelArrays) -> Floats:
 def distances(outline: Floats, others: Floats) -> Floats:
     """How far a pose moves the farthest of its seven points from another's, (H,), metres."""
     return np.asarray(np.linalg.norm(others - outline, axis=2).max(axis=1))
+
+
+def nearest(some: Floats, others: Floats) -> Floats:
+    """Of each of some outlines (H, 7, 3) how far it is from the nearest of others (K, 7, 3), (H,); inf of none."""
+    found = np.full(len(some), np.inf)
+    for other in others:
+        np.minimum(found, np.linalg.norm(some - other, axis=2).max(axis=1), out=found)
+    return found
