@@ -16,9 +16,10 @@ from scanfind.schema import (
     Quaternion,
     Results,
     ScanEntry,
+    Vector,
 )
 
-STATIONS = [(0.0, 0.0, 1.5), (4.0, 0.0, 1.5), (0.0, 4.0, 1.5)]
+STATIONS: list[Vector | None] = [(0.0, 0.0, 1.5), (4.0, 0.0, 1.5), (0.0, 4.0, 1.5)]
 
 
 def at(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Matrix:
