@@ -112,7 +112,7 @@ def surface_dots(triangles: Floats, colour: Sequence[int], seed: int, count: int
     u, v = np.where(over, 1.0 - u, u), np.where(over, 1.0 - v, v)
     light = 0.72 + 0.28 * np.abs(normals[of] @ np.array([0.3, -0.5, 0.81])) / np.maximum(doubled[of], 1e-300)
     colours = (np.asarray(colour) * light[:, None]).astype(np.uint8)
-    return Dots(triangles[of, 0] + u * edges[0][of] + v * edges[1][of], colours, 2)
+    return Dots(triangles[of, 0] + u * edges[0][of] + v * edges[1][of], colours, 3)
 
 
 def png(image: Bytes) -> bytes:

@@ -138,7 +138,7 @@ def _detection(
 ) -> Item:
     judgement = None if profile is None else judge_detection(profile, results, found, discs)
     x, y, z = found.translation_m
-    numbers = [("Stands at x / y / z", f"{x:.3f} / {y:.3f} / {z:.3f} m"), *_of_instance(found)]
+    numbers = [("Stands at x / y / z", f"{x:z.3f} / {y:z.3f} / {z:z.3f} m"), *_of_instance(found)]
     return Item(
         key=f"d{found.id}",
         name=f"{found.model} {found.id}",
@@ -148,7 +148,7 @@ def _detection(
         status=FOUND,
         verdict="" if judgement is None else judgement.verdict,
         verdict_why="" if judgement is None else judgement.why,
-        headline=f"found at {x:.3f}, {y:.3f}, {z:.3f} m",
+        headline=f"found at {x:z.3f}, {y:z.3f}, {z:z.3f} m",
         sentences=detection_sentences(results, found),
         numbers=tuple(pair for pair in numbers if pair[1] != "–"),
         judgement=judgement,

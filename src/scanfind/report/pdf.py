@@ -9,9 +9,11 @@ from itertools import pairwise
 from math import degrees
 from typing import TYPE_CHECKING, Any
 
+from scanfind.elements import INSTALLED
 from scanfind.errors import MissingExtraError
 from scanfind.picture import SCALE, png
 from scanfind.report.pictures import picture_of
+from scanfind.tolerances import NOT_JUDGED
 
 if TYPE_CHECKING:
     from scanfind.report.content import Content
@@ -20,6 +22,10 @@ if TYPE_CHECKING:
 MOST_DETAILED = 150  # items with a page's half each: what has more is read on a screen
 PICTURE = (900, 560)  # pixels
 SOFT, LINE = "#626a73", "#dfe1de"
+FONTS = (
+    ("DejaVu", "DejaVu-Bold", ("DejaVuSans.ttf", "DejaVuSans-Bold.ttf")),
+    ("Vera", "Vera-Bold", ("Vera.ttf", "VeraBd.ttf")),
+)
 DOTS = {
     "installed": "#2c7a57", "found": "#2c7a57", "in_tolerance": "#2c7a57", "not_found": "#b3261e",
     "out_of_tolerance": "#b3261e", "uncertain": "#a8690f", "not_judged": "#a8690f",
@@ -77,9 +83,8 @@ def _story(content: Content, width: float) -> Iterator[Any]:
 
 
 def _full(content: Content) -> float:
-    """The deviation with the colour of the scale's end: twice what 95 % of all points keep within."""
-    p95 = [item.p95_m for item in content.items if item.p95_m]
-    return 2.0 * max(p95, default=0.005)
+    """The deviation with the colour of the scale's end: what 95 % of the points of every item keep within."""
+    return max((item.p95_m for item in content.items if item.p95_m), default=0.005)
 
 
 def _counts(content: Content, style: dict[str, Any], width: float) -> Any:
@@ -101,9 +106,9 @@ def _table(content: Content, style: dict[str, Any], width: float) -> Any:
     """One line an item."""
     from reportlab.platypus import Paragraph, Table, TableStyle
 
-    heads = ("Element", "Status", "Verdict", "Off mm", "Turned °", "95 % mm", "Points")
+    heads = ("Element", "Status", "Verdict", "Off mm", "Turned °", "Surface mm", "Points")
     if not content.of_design:
-        heads = ("Instance", "Status", "Verdict", "Score", "", "95 % mm", "Points")
+        heads = ("Instance", "Status", "Verdict", "Score", "", "Surface mm", "Points")
     rows = [[Paragraph(f"<b>{head}</b>", style["small" if k < 3 else "right"]) for k, head in enumerate(heads)]]
     for item in content.items:
         score = item.found.score if item.found and not content.of_design else None
@@ -124,7 +129,7 @@ def _table(content: Content, style: dict[str, Any], width: float) -> Any:
             [Paragraph(text, style["small"]) for text in words]
             + [Paragraph(number, style["right"]) for number in numbers]
         )
-    shares = (0.29, 0.15, 0.18, 0.09, 0.1, 0.09, 0.1)
+    shares = (0.27, 0.15, 0.18, 0.09, 0.1, 0.11, 0.1)
     table = Table(rows, colWidths=[share * width for share in shares], repeatRows=1)
     table.setStyle(
         TableStyle([
@@ -149,8 +154,10 @@ def _detail(content: Content, item: Item, full: float, style: dict[str, Any], wi
     told += [Paragraph(_safe(sentence), style["text"]) for sentence in item.sentences]
     if item.judgement and item.verdict != "in_tolerance":
         told.append(Paragraph(_safe(f"{item.verdict_words.capitalize()}: {item.verdict_why}."), style["text"]))
+    # Nothing is to be seen of an element that stands in its place but for what a limit could not be held against.
     stations = [place for scan in content.results.scans for place in scan.stations_m if place is not None]
-    picture = picture_of(item, content.material, stations, full, *PICTURE)
+    plain = item.verdict == NOT_JUDGED and item.status == INSTALLED
+    picture = None if plain else picture_of(item, content.material, stations, full, *PICTURE)
     if picture is not None:
         wide = 0.72 * width
         told += [Spacer(1, 4), Image(io.BytesIO(png(picture)), wide, wide * PICTURE[1] / PICTURE[0], hAlign="LEFT")]
@@ -159,23 +166,20 @@ def _detail(content: Content, item: Item, full: float, style: dict[str, Any], wi
 
 def _legend(full: float, style: dict[str, Any], width: float) -> Iterator[Any]:
     """The scale of deviations, with its unit."""
-    from reportlab.graphics.shapes import Drawing, Rect, String
+    from reportlab.graphics.shapes import Drawing, Rect
     from reportlab.lib.colors import Color
+    from reportlab.platypus import Paragraph
 
     steps, wide = 60, 0.36 * width
-    drawing = Drawing(width, 26)
+    drawing = Drawing(width, 14)
     for k in range(steps):
         at = 2.0 * k / (steps - 1) - 1.0
-        red, green, blue = (_between(at, channel) / 255.0 for channel in range(3))
-        fill = Color(red, green, blue)
-        drawing.add(Rect(k * wide / steps, 12, wide / steps + 0.3, 8, fillColor=fill, strokeColor=None))
-    for x, text, anchor in (
-        (0.0, f"-{1e3 * full:.1f} mm, inside", "start"), (wide, f"+{1e3 * full:.1f} mm, outside", "end"),
-    ):  # fmt: skip
-        drawing.add(String(x, 2, text, fontName=style["soft"].fontName, fontSize=7, textAnchor=anchor))
-    words = "distance of points from the model; grey: model and scan; red surface: designed, not found"
-    drawing.add(String(wide + 10, 13, words, fontName=style["soft"].fontName, fontSize=7))
+        fill = Color(*(_between(at, channel) / 255.0 for channel in range(3)))
+        drawing.add(Rect(k * wide / steps, 2, wide / steps + 0.3, 8, fillColor=fill, strokeColor=None))
     yield drawing
+    ends = f"{1e3 * full:.1f} mm inside (blue) to {1e3 * full:.1f} mm outside the model (red)"
+    yield Paragraph(f"Points by their distance from the model, from {ends}.", style["soft"])
+    yield Paragraph("Grey: the model, and the scan around it. Red surface: designed, and not found.", style["soft"])
 
 
 def _between(at: float, channel: int) -> float:
@@ -203,16 +207,20 @@ def _styles() -> dict[str, Any]:
 
 
 def _fonts() -> tuple[str, str]:
-    """The font that reportlab brings and embeds, and its bold."""
+    """A font to embed and its bold: DejaVu, which has most scripts, where the system has it; else reportlab's own."""
     from reportlab.pdfbase import pdfmetrics
-    from reportlab.pdfbase.ttfonts import TTFont
+    from reportlab.pdfbase.ttfonts import TTFError, TTFont
 
-    plain, bold = "Vera", "Vera-Bold"
-    if bold not in pdfmetrics.getRegisteredFontNames():
-        pdfmetrics.registerFont(TTFont(plain, "Vera.ttf"))
-        pdfmetrics.registerFont(TTFont(bold, "VeraBd.ttf"))
-        pdfmetrics.registerFontFamily(plain, normal=plain, bold=bold, italic=plain, boldItalic=bold)
-    return plain, bold
+    for plain, bold, files in FONTS:
+        try:
+            if bold not in pdfmetrics.getRegisteredFontNames():
+                for name, file in zip((plain, bold), files, strict=True):
+                    pdfmetrics.registerFont(TTFont(name, file))
+                pdfmetrics.registerFontFamily(plain, normal=plain, bold=bold, italic=plain, boldItalic=bold)
+        except TTFError:
+            continue
+        return plain, bold
+    return "Helvetica", "Helvetica-Bold"
 
 
 def _footer(title: str) -> Any:
@@ -228,7 +236,7 @@ def _footer(title: str) -> Any:
 
 def _dot(key: str) -> str:
     colour = DOTS.get(key, "#7c858e")
-    return f'<font color="{colour}">\u25cf</font> ' if key else ""
+    return f'<font color="{colour}">•</font> ' if key else ""
 
 
 def _number(value: float | None, factor: float, decimals: int = 1) -> str:

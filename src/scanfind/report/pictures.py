@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 MODEL, MISSING, AROUND = (150, 163, 178), (214, 106, 96), (178, 178, 174)
+DOTS = 150_000  # of a surface: no pixel of it stays open
 STEEPNESS = 0.45  # how much the view looks down, where nobody stood
 
 
@@ -52,10 +53,9 @@ def layers_of(item: Item, material: Material, full: float) -> tuple[list[Dots], 
         triangles = shape.placed(pose)
         colour = MODEL if item.found else MISSING
         if len(shape.faces):
-            drawn = surface_dots(triangles, colour, seed=0)
+            drawn = surface_dots(triangles, colour, seed=0, count=DOTS)
         else:
             drawn = Dots(triangles[:, 0], np.tile(np.array(colour, np.uint8), (len(triangles), 1)), 2)
-        # A hair behind the points, which lie on it: half of them would be hidden by it.
         layers.insert(0, drawn)
         seen.append(triangles.reshape(-1, 3))
     return layers, np.concatenate(seen)

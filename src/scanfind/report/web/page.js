@@ -81,7 +81,7 @@ function refresh() {
   if (!viewer) return;
   const c = (name) => colour(name);
   viewer.colours = {
-    paper: c("--view"), in: c("--in"), none: c("--none"), scan: c("--none"), design: c("--accent"),
+    paper: c("--view"), in: c("--in"), none: c("--none"), scan: c("--scan"), design: c("--accent"),
     installed: c("--in"), found: c("--in"), in_tolerance: c("--in"), not_found: c("--out"), out_of_tolerance: c("--out"),
     uncertain: c("--open"), not_judged: c("--open"), occluded: c("--none"), not_enough_data: c("--none"), no_data: c("--none"),
   };
@@ -115,7 +115,7 @@ function choose(k, { look = true, scroll = true } = {}) {
   if (scroll && k >= 0) document.querySelector('tr[aria-selected="true"]').scrollIntoView({ block: "nearest" });
   if (!viewer) return;
   viewer.selected = k;
-  if (look && k >= 0 && viewer.boxes[k]) viewer.camera.see(viewer.boxes[k], 1.15);
+  if (look && k >= 0 && viewer.boxes[k]) viewer.camera.see(viewer.boxes[k], 0.85);
   refresh();
 }
 
