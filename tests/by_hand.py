@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from scanfind.elements import INSTALLED
+import numpy as np
+
+from scanfind.detection import Detection, Findings, IsolatedPoints, SceneScan
+from scanfind.deviation import deviation_of
+from scanfind.elements import INSTALLED, NOT_FOUND, Element
+from scanfind.library import ModelLibrary
+from scanfind.mesh import Placement
+from scanfind.model import ModelParameters, build_model
+from scanfind.pose import Pose
+from scanfind.results import write_results
 from scanfind.schema import (
     DetectionEntry,
     DeviationEntry,
@@ -18,6 +30,8 @@ from scanfind.schema import (
     ScanEntry,
     Vector,
 )
+from scanfind.simulate.parts import blocks
+from scanfind.surface import SurfaceParameters
 
 STATIONS: list[Vector | None] = [(0.0, 0.0, 1.5), (4.0, 0.0, 1.5), (0.0, 4.0, 1.5)]
 
@@ -82,3 +96,40 @@ def results(*entries: ElementEntry | DetectionEntry, **said: Any) -> Results:
         "peak_memory_bytes": 0,
     }  # fmt: skip
     return Results(**values | said)
+
+
+def folder_by_hand(out: Path, *, names: Sequence[str] = ("B1", "B2", "B3"), points: int = 4000) -> Path:
+    """A result folder as an inspection leaves it, made without a search: the first element in its place, the second
+    20 mm too low, the others not found; points 1 mm about the surface, a tenth of them 6 mm outside.
+    """  # fmt: skip
+    rng = np.random.default_rng(0)
+    mesh = blocks("beam", [((0, 0, 0), (2.0, 0.3, 0.1)), ((0, 0, 0), (0.1, 0.3, 0.8))])
+    model = build_model(mesh, ModelParameters(SurfaceParameters(samples=200)))
+    triangles = mesh.triangles()
+    findings = Findings()
+    for number, low in ((1, 0.0), (2, -0.02)):
+        pose = Pose(np.eye(3), np.array([0.0, 1.5 * number, low]))
+        of = rng.integers(0, len(triangles), points)
+        weights = rng.dirichlet((1.0, 1.0, 1.0), points)
+        normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])[of]
+        deviation = np.where(rng.random(points) < 0.1, 0.006, rng.normal(0.0, 0.001, points))
+        normals *= deviation[:, None] / np.linalg.norm(normals, axis=1, keepdims=True)
+        xyz = pose.move(np.einsum("nk,nkj->nj", weights, triangles[of]) + normals)
+        ids = np.arange(points)
+        cut = IsolatedPoints(xyz, {}, np.zeros(points, np.int32), ids, deviation.astype(np.float32))
+        found = Detection(number, "beam", pose, 0.97, 0.6, 0.97, 0.0, 0.6, 0.001)
+        covariance = np.diag([1e-8] * 6)
+        pivot = (1.0, 1.5 * number, 0.2)
+        findings.append(replace(found.with_points(cut, deviation_of(deviation)), covariance=covariance, pivot=pivot))
+    for k, name in enumerate(names, 1):
+        placement = Placement(f"gid{k}", "IfcBeam", name, Pose(np.eye(3), np.array([0.0, 1.5 * k, 0.0])))
+        missing = Element(placement, "beam", NOT_FOUND, None, None, None, None, 0.0, 0.1, 0.6, 0.3, "missing")
+        off = 0.02 if k == 2 else 0.0
+        moved = replace(missing, status=INSTALLED, detection=k, shift_m=(0.0, 0.0, -off), turn_rad=0.0, off_m=off)
+        findings.elements.append(replace(moved, on=0.9, beside=0.0, through=0.0, hidden=0.1) if k <= 2 else missing)
+    findings.scans = [SceneScan("hall.e57", 100_000, 0, tuple(STATIONS))]
+    findings.tolerance_m, findings.allowed_m = 0.008, 0.03
+    with ModelLibrary.in_memory() as models:
+        models.put(model)
+        write_results(findings, out, models=models, parameters={})
+    return out

@@ -109,7 +109,8 @@ def absence_sentences(each: ElementEntry, looked_from: str) -> tuple[str, ...]:
         return ("Too little of its surface was looked at to say whether it is there.", *filter(None, [behind]))
     if there >= max(empty, other):
         told.append(f"{share(there)} of the surface looked at is there, which does not settle that it is the element.")
-        told.append(f"{share(other)} is something else, {share(empty)} empty space.")
+        rest = [(other, "something else"), (empty, "empty space")]
+        told += [f"{share(part)} of it is {what}." for part, what in rest if part >= 0.005]
         return (*told, *filter(None, [behind]))
     if empty >= other:
         told.append(f"{share(empty)} of the surface that {looked_from} should see is empty space.")

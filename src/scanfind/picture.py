@@ -43,11 +43,15 @@ class View(NamedTuple):
 
 
 class Dots(NamedTuple):
-    """Points to be drawn: points (N, 3) metres, colours (N, 3), and how wide each is, pixels."""
+    """Points to be drawn: points (N, 3) metres, colours (N, 3), and how wide each is, pixels.
+
+    behind : metres they yield to others by: a surface would hide half of the points that lie on it
+    """
 
     points: Floats
     colours: Bytes
     width: int = 1
+    behind: float = 0.0
 
 
 def view_at(
@@ -139,6 +143,7 @@ def _splat(image: Bytes, depth: Floats, view: View, dots: Dots) -> None:
     away, far, colours = away[seen], far[seen], dots.colours[seen]
     x = 0.5 * width + scale * (away @ np.cross(view.forward, view.up)) / far
     y = 0.5 * height - scale * (away @ view.up) / far
+    far = far + dots.behind
     for step in range(dots.width**2):
         aside, down = step % dots.width, step // dots.width
         column, row = np.floor(x - dots.width / 2 + 0.5 + aside), np.floor(y - dots.width / 2 + 0.5 + down)

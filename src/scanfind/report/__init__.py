@@ -102,8 +102,8 @@ def _write(paths: Sequence[Path], content: Content) -> None:
             parts = []
             for path, data in made:
                 part = path.with_name(f".{path.name}.{os.getpid()}.part")
-                stack.callback(part.unlink, missing_ok=True)
                 path.parent.mkdir(parents=True, exist_ok=True)
+                stack.callback(part.unlink, missing_ok=True)
                 part.write_bytes(data)
                 parts.append((part, path))
             for part, path in parts:

@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 
 MODEL, MISSING, AROUND = (150, 163, 178), (214, 106, 96), (178, 178, 174)
 DOTS = 150_000  # of a surface: no pixel of it stays open
+YIELD_M = 0.02  # by which a model yields to the points on it
 STEEPNESS = 0.45  # how much the view looks down, where nobody stood
 
 
@@ -53,7 +54,7 @@ def layers_of(item: Item, material: Material, full: float) -> tuple[list[Dots], 
         triangles = shape.placed(pose)
         colour = MODEL if item.found else MISSING
         if len(shape.faces):
-            drawn = surface_dots(triangles, colour, seed=0, count=DOTS)
+            drawn = surface_dots(triangles, colour, seed=0, count=DOTS)._replace(behind=YIELD_M)
         else:
             drawn = Dots(triangles[:, 0], np.tile(np.array(colour, np.uint8), (len(triangles), 1)), 2)
         layers.insert(0, drawn)

@@ -16,7 +16,7 @@ void main() {
   at = low + position * size;
   told = value;
   gl_Position = clipFromScene * vec4(at, 1.0);
-  gl_PointSize = clamp(width / gl_Position.w, least, 5.0 * least);
+  gl_PointSize = clamp(width / gl_Position.w, least, 4.0 * least);
 }`;
 
 // how: 0 deviation, 1 within the limit, 2 one colour, 3 how light.
@@ -35,7 +35,8 @@ vec3 ramp(float t) {
   return mix(stops[k], stops[k + 1], s - float(k));
 }
 void main() {
-  if (outside(at)) discard;
+  vec2 aside = gl_PointCoord - 0.5;
+  if (outside(at) || dot(aside, aside) > 0.26) discard;
   vec3 c = flatColour;
   if (how == 0) c = ramp(told * full / limit);
   if (how == 1) c = abs(told * full) <= limit ? within : (told > 0.0 ? stops[4] : stops[0]);

@@ -188,7 +188,7 @@ class Viewer {
     const at = this.use(this.programs.points);
     gl.uniform3fv(at.faded, colours.scan);
     gl.uniform1f(at.full, this.facts.full);
-    gl.uniform1f(at.limit, this.limit);
+    gl.uniform1f(at.limit, this.limit + this.facts.full / 254);
     gl.uniform3fv(at.within, colours.in);
     gl.uniform3fv(at.stops, this.scale.flatMap(([, colour]) => colour.map((c) => c / 255)));
     this.clouds.forEach((cloud, k) => {
@@ -219,19 +219,22 @@ class Viewer {
     const { gl, camera } = this;
     const at = this.use(this.programs.shape);
     gl.uniform3fv(at.towards, camera.back());
+    gl.enable(gl.POLYGON_OFFSET_FILL);
+    gl.polygonOffset(1, 8);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
     for (const { k, pose, shape, ghost } of this.posed()) {
       // Where nothing was found, the design is all there is to see; behind points a model only hints at the shape.
       const lone = !this.facts.items[k].cloud;
       gl.uniform3fv(at.flatColour, ghost ? this.colours.design : this.modelColour(k));
-      gl.uniform1f(at.opacity, k === this.selected ? 0.6 : lone ? 0.5 : 0.28);
+      gl.uniform1f(at.opacity, lone && !ghost ? (k === this.selected ? 0.75 : 0.5) : 0.3);
       gl.uniform1i(at.faces, shape.faces > 0);
       gl.depthMask(lone && k === this.selected);
       this.drawShape(at, shape, pose);
     }
     gl.depthMask(true);
     gl.disable(gl.BLEND);
+    gl.disable(gl.POLYGON_OFFSET_FILL);
   }
 
   // The shapes that are to be drawn, and where.
@@ -330,7 +333,7 @@ class Viewer {
   within(k) {
     const cloud = this.clouds[k];
     if (!cloud) return null;
-    const most = this.limit / this.facts.full * 127 + 1e-6;
+    const most = this.limit / this.facts.full * 127 + 0.5; // half a step: what is at the limit is within it
     let count = 0;
     for (let j = cloud.first; j < cloud.first + cloud.count; j++) count += Math.abs(this.values[j]) <= most;
     return count / cloud.count;
