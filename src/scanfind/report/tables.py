@@ -84,7 +84,7 @@ def _row(item: Item) -> list[Cell]:
 
 
 def _mm(value: float | None) -> float | None:
-    return None if value is None else round(1e3 * value, 4)
+    return None if value is None else round(1e3 * value, 4) + 0.0  # never -0.0
 
 
 def _harmless(text: str) -> str:

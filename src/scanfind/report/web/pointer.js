@@ -28,7 +28,7 @@ function listen(viewer, onClick) {
       camera.pan(x / 2, y / 2, canvas.clientHeight);
     } else if (event.buttons & 6 || event.shiftKey) camera.pan(x, y, canvas.clientHeight);
     else camera.turn(x, y, viewer.flying);
-    viewer.redraw();
+    viewer.redraw(true);
   });
   const up = (event) => {
     if (!down.delete(event.pointerId) || event.type !== "pointerup" || moved > 4 || event.button) return;
@@ -41,7 +41,7 @@ function listen(viewer, onClick) {
     event.preventDefault();
     if (viewer.flying) camera.fly(0, 0, -event.deltaY * 0.001 * camera.distance);
     else camera.zoom(Math.exp(event.deltaY * 0.0012));
-    viewer.redraw();
+    viewer.redraw(true);
   }, { passive: false });
   let last = 0;
   const step = (now) => {
@@ -49,7 +49,7 @@ function listen(viewer, onClick) {
     last = now;
     for (const key of held) camera.fly(...KEYS[key].map((way) => way * seconds * camera.extent * 0.15));
     if (!held.size) return;
-    viewer.draw();
+    viewer.redraw(true);
     requestAnimationFrame(step);
   };
   canvas.addEventListener("keydown", (event) => {

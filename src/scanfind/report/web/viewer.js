@@ -2,12 +2,13 @@
 
 const NO_CUT = 1e9;
 const AROUND = 0xffffff;
+const SLOW_MS = 45, REST_MS = 180;
 
 class Viewer {
   constructor(canvas, facts, buffers, scale) {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
     if (!gl) throw new Error("this browser has no WebGL 2");
-    Object.assign(this, { gl, canvas, facts, scale, camera: new Camera(), selected: -1, colouring: 0, limit: facts.full });
+    Object.assign(this, { gl, canvas, facts, scale, camera: new Camera(), selected: -1, colouring: 0, share: 1, part: 1, limit: facts.full });
     this.layers = { points: true, model: true, design: false, around: true };
     this.cut = [[-NO_CUT, -NO_CUT, -NO_CUT], [NO_CUT, NO_CUT, NO_CUT]];
     this.colours = {};
@@ -112,10 +113,27 @@ class Viewer {
     ], [[], []]);
   }
 
-  redraw() {
+  // While things move, a slow machine draws fewer points, which are in an order drawn by chance; all when they stand.
+  redraw(moving = false) {
+    clearTimeout(this.resting);
+    this.moving = moving;
     if (this.waiting) return;
     this.waiting = true;
-    requestAnimationFrame(() => { this.waiting = false; this.draw(); });
+    requestAnimationFrame(() => {
+      this.waiting = false;
+      const now = performance.now();
+      const took = this.moving && this.last ? now - this.last : 0;
+      this.last = this.moving ? now : 0;
+      if (took) this.part = Math.min(Math.max(this.part * (took > SLOW_MS ? 0.5 : 1.1), 0.05), 1);
+      this.share = this.moving ? this.part : 1;
+      this.draw();
+      this.share = 1;
+      // Counted from the next frame, which waits for this one: a slow one would seem a rest.
+      if (this.moving) requestAnimationFrame(() => {
+        clearTimeout(this.resting);
+        this.resting = setTimeout(() => this.redraw(), REST_MS);
+      });
+    });
   }
 
   resize() {
@@ -212,7 +230,7 @@ class Viewer {
     gl.uniform1f(at.width, this.spacing(cloud) * this.canvas.height / (2 * Math.tan(this.camera.field / 2)));
     gl.uniform1f(at.least, 1.5 * Math.min(window.devicePixelRatio || 1, 2));
     gl.bindVertexArray(cloud.array);
-    gl.drawArrays(gl.POINTS, 0, cloud.count);
+    gl.drawArrays(gl.POINTS, 0, Math.ceil(cloud.count * this.share));
   }
 
   drawShapes() {
