@@ -69,9 +69,11 @@ def gather(folder: Path, results: Results, models: Sequence[Model], scans: Seque
     Raises UnreadableFileError for a point file or scan that is damaged.
     """
     notes: list[str] = []
-    clouds = {found.id: _isolated(folder, found.isolated, notes) for found in results.detections if found.isolated}
-    each = _level([len(cloud.xyz) for cloud in clouds.values()], int((1.0 - OF_SCAN) * most))
-    points = {number: _thinned(cloud, each, number) for number, cloud in clouds.items() if len(cloud.xyz)}
+    cut = [found for found in results.detections if found.isolated]
+    each = _level([found.points for found in cut], int((1.0 - OF_SCAN) * most))
+    # Thinned one by one, since all together may be more than memory holds.
+    clouds = {found.id: _thinned(_isolated(folder, str(found.isolated), notes), each, found.id) for found in cut}
+    points = {number: cloud for number, cloud in clouds.items() if len(cloud.xyz)}
     shapes = {model.name: shape_of(model) for model in models}
     wanted = {each.model for each in results.elements} | {one.model for one in results.detections}
     if missing := wanted - set(shapes):

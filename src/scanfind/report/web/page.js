@@ -115,7 +115,7 @@ function choose(k, { look = true, scroll = true } = {}) {
   if (scroll && k >= 0) document.querySelector('tr[aria-selected="true"]').scrollIntoView({ block: "nearest" });
   if (!viewer) return;
   viewer.selected = k;
-  if (look && k >= 0 && viewer.boxes[k]) viewer.camera.see(viewer.boxes[k], 0.85);
+  if (look && k >= 0 && viewer.boxes[k]) viewer.camera.see(viewer.boxes[k], 1.05);
   refresh();
 }
 
