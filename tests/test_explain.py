@@ -95,6 +95,7 @@ def test_parts_that_are_off_missing_or_unseen_are_named_and_no_others() -> None:
     assert "Its part bent is 20 mm off, turned by 2.86°." in words
     assert "Its part clip is missing: beams passed through 80 % of it." in words
     assert "Its part dark cannot be judged" in words
+    assert words.startswith("Its part bent")
 
 
 def test_a_headline_is_one_line() -> None:

@@ -142,6 +142,17 @@ def test_points_are_kept_to_a_65536th_of_their_box_and_deviations_to_a_127th(sou
         )
 
 
+def test_an_instance_that_no_element_is_taken_for_is_told(sound: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(sound, tmp_path / "copy")
+    told = json.loads((folder / RESULTS_JSON).read_text())
+    told["elements"][1].update(status="not_found", detection=None, shift_m=None, turn_rad=None, off_m=None)
+    (folder / RESULTS_JSON).write_text(json.dumps(told))
+    items = written(folder, tmp_path / "a.html").items
+    assert [(item.name, item.status_words) for item in items] == [
+        ("B2", "not found"), ("B3", "not found"), ("beam 2", "not in the design"), ("B1", "installed"),
+    ]  # fmt: skip
+
+
 def test_fewer_points_make_a_smaller_page(sound: Path, tmp_path: Path) -> None:
     content = written(sound, tmp_path / "a.html", points=1000)
     assert sum(len(cloud.xyz) for cloud in content.material.points.values()) <= 1000
@@ -298,6 +309,15 @@ def test_a_damaged_result_is_one_line_and_no_report(
     assert main(["report", str(folder), "--out", str(tmp_path / "a.html")]) == 1
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "a.html").exists()
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity"])
+def test_numbers_that_are_none_are_refused(sound: Path, tmp_path: Path, number: str) -> None:
+    folder = shutil.copytree(sound, tmp_path / "copy")
+    text = (folder / RESULTS_JSON).read_text()
+    (folder / RESULTS_JSON).write_text(text.replace('"off_m": 0.02', f'"off_m": {number}'))
+    with pytest.raises(UnreadableFileError):
+        written(folder, tmp_path / "a.html")
 
 
 def test_no_result_is_an_error(tmp_path: Path) -> None:

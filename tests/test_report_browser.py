@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -110,6 +111,20 @@ def test_names_are_shown_and_never_run(shown: Page) -> None:
     shown.run("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=\"window.hacked = 3\">')")
     time.sleep(0.1)
     assert shown.run("typeof window.hacked") == "undefined"  # the page's own policy refuses what escaping would miss
+
+
+def test_a_status_that_nobody_knows_is_shown_as_it_is(page: Page, report: tuple[Path, Content], tmp_path: Path) -> None:
+    odd = tmp_path / "odd"
+    shutil.copytree(report[0].parent / "inspected", odd)
+    text = (odd / "results.json").read_text()
+    (odd / "results.json").write_text(text.replace('"status": "not_found"', '"status": "__proto__ \\"><b>"'))
+    write_report(odd, [tmp_path / "odd.html"])
+    page.complaints.clear()
+    page.open(tmp_path / "odd.html")
+    settled(page)
+    assert page.run("document.getElementById('status').textContent") == ""
+    assert page.run("document.querySelectorAll('td b').length") == 0
+    assert not page.complaints
 
 
 def test_an_element_is_picked_in_the_picture_and_in_the_table(shown: Page) -> None:

@@ -53,7 +53,7 @@ def detection_sentences(results: Results, found: DetectionEntry, *, of_design: b
 
     of_design : it stands for an element of a design: how much of it is there goes without its score
     """
-    told = []
+    told = [part_in_words(part) for part in found.parts if part.status == "missing" or is_off(part)]
     if found.coverage is not None:
         told.append(f"The scan shows {share(found.coverage)} of its surface.")
     if not of_design and found.visible_support is not None and found.visible_support > 0.0:
@@ -64,7 +64,7 @@ def detection_sentences(results: Results, found: DetectionEntry, *, of_design: b
         told.append(f"Beams passed through {share(found.penalty)} of it, as if it were not there.")
     told.extend(surface_in_words(found))
     told.extend(certainty_in_words(found))
-    told.extend(part_in_words(part) for part in found.parts if part.status != "measured" or is_off(part))
+    told.extend(part_in_words(part) for part in found.parts if part.status == "not_seen")
     return tuple(told)
 
 
@@ -143,7 +143,8 @@ def surface_in_words(found: DetectionEntry) -> list[str]:
         return []
     side = "outside" if deviation.mean_m > 0 else "inside"
     mean = "in the mean on it" if abs(deviation.mean_m) < 5e-5 else f"in the mean {length(deviation.mean_m)} {side} it"
-    return [f"95 % of its {found.points:,} points lie within {length(deviation.p95_m)} of its surface, {mean}."]
+    surface = "the surface of its parts as built" if found.parts else "its surface"
+    return [f"95 % of its {found.points:,} points lie within {length(deviation.p95_m)} of {surface}, {mean}."]
 
 
 def certainty_in_words(found: DetectionEntry) -> list[str]:

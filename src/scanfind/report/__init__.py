@@ -9,9 +9,10 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from datetime import date
+from math import isfinite
 from pathlib import Path
 
-from scanfind.errors import OutputError, UnsupportedFormatError, UsageError
+from scanfind.errors import OutputError, UnreadableFileError, UnsupportedFormatError, UsageError
 from scanfind.report.content import Content
 from scanfind.report.items import items_of
 from scanfind.report.material import gather, models_of
@@ -64,6 +65,9 @@ def write_report(
     folder = Path(result_dir)
     folder = folder if folder.is_dir() else folder.parent
     results = read_results(result_dir)
+    if not _is_finite(results.model_dump()):
+        msg = f"{result_dir}: its results.json holds a number that is none (NaN or infinite): search again"
+        raise UnreadableFileError(msg)
     told = None if results.allowed_m is None else allowed_off(results.allowed_m)
     profile = told if tolerance is None else load_profile(tolerance)
     models = models_of(folder)
@@ -78,6 +82,15 @@ def write_report(
     )
     _write(paths, content)
     return content
+
+
+def _is_finite(node: object) -> bool:
+    """Are all numbers of nested lists and tables finite? JSON as Python reads it may say NaN."""
+    if isinstance(node, dict):
+        return all(map(_is_finite, node.values()))
+    if isinstance(node, (list, tuple)):
+        return all(map(_is_finite, node))
+    return not isinstance(node, float) or isfinite(node)
 
 
 def _check(paths: Sequence[Path], points: int, *, overwrite: bool) -> None:

@@ -38,8 +38,8 @@ class Content:
 
     @property
     def noun(self) -> str:
-        """What its items are."""
-        return "elements" if self.of_design else "instances"
+        """What its items are, one or many."""
+        return ("element" if self.of_design else "instance") + ("" if len(self.items) == 1 else "s")
 
     def counts(self) -> list[tuple[str, str, int]]:
         """How many items have which status and verdict: key, words, how many."""

@@ -17,10 +17,12 @@ if TYPE_CHECKING:
     from scanfind.tolerances import Profile
     from scanfind.tolerances.discs import Disc
 
-FOUND = "found"  # the status of an instance that no design asked for
+FOUND = "found"  # the status of an instance, where there is no design
+EXTRA = "extra"  # of one that no element of the design is taken for
+WORDS = {**STATUS_WORDS, EXTRA: "not in the design"}
 VERDICT_WORDS = {IN: "in tolerance", OUT: "out of tolerance", NOT_JUDGED: "not judged", "": "–"}
 # What needs a look comes first.
-ORDER = (NOT_FOUND, UNCERTAIN, OCCLUDED, NOT_ENOUGH_DATA, NO_DATA, INSTALLED, FOUND)
+ORDER = (NOT_FOUND, UNCERTAIN, EXTRA, OCCLUDED, NOT_ENOUGH_DATA, NO_DATA, INSTALLED, FOUND)
 VERDICT_ORDER = (OUT, NOT_JUDGED, "", IN)
 
 
@@ -56,7 +58,7 @@ class Item:
     @property
     def status_words(self) -> str:
         """Its status, for people."""
-        return STATUS_WORDS.get(self.status, self.status.replace("_", " "))
+        return WORDS.get(self.status, self.status.replace("_", " "))
 
     @property
     def verdict_words(self) -> str:
@@ -78,17 +80,17 @@ def items_of(
     results: Results, profile: Profile | None, discs: Mapping[tuple[str, str], Disc] | None = None
 ) -> list[Item]:
     """All items of a result, what needs a look first; judged by a profile, where there is one."""
-    if results.elements or not results.detections:
-        items = [_element(results, each, k, profile, discs) for k, each in enumerate(results.elements, 1)]
-    else:
-        items = [_detection(results, found, profile, discs) for found in results.detections]
+    items = [_element(results, each, k, profile, discs) for k, each in enumerate(results.elements, 1)]
+    taken = {each.detection for each in results.elements}
+    status = EXTRA if results.elements else FOUND
+    items += [_detection(results, one, status, profile, discs) for one in results.detections if one.id not in taken]
     return sorted(items, key=lambda item: (_place(ORDER, item.status), VERDICT_ORDER.index(item.verdict), item.name))
 
 
 def counts_of(items: Sequence[Item]) -> list[tuple[str, str, int]]:
     """How many items have which status and which verdict: its name, its words, how many; none that nobody has."""
     statuses, verdicts = Counter(item.status for item in items), Counter(item.verdict for item in items)
-    told = [(status, STATUS_WORDS.get(status, status), statuses[status]) for status in (*ORDER[::-1],)]
+    told = [(status, WORDS.get(status, status), statuses[status]) for status in (*ORDER[::-1],)]
     told += [(verdict, VERDICT_WORDS[verdict], verdicts[verdict]) for verdict in (IN, OUT, NOT_JUDGED)]
     return [line for line in told if line[2]]
 
@@ -134,8 +136,9 @@ def _element(
 
 
 def _detection(
-    results: Results, found: DetectionEntry, profile: Profile | None, discs: Mapping[tuple[str, str], Disc] | None
-) -> Item:
+    results: Results, found: DetectionEntry, status: str, profile: Profile | None,
+    discs: Mapping[tuple[str, str], Disc] | None,
+) -> Item:  # fmt: skip
     judgement = None if profile is None else judge_detection(profile, results, found, discs)
     x, y, z = found.translation_m
     numbers = [("Stands at x / y / z", f"{x:z.3f} / {y:z.3f} / {z:z.3f} m"), *_of_instance(found)]
@@ -145,7 +148,7 @@ def _detection(
         ifc_class="",
         global_id="",
         model=found.model,
-        status=FOUND,
+        status=status,
         verdict="" if judgement is None else judgement.verdict,
         verdict_why="" if judgement is None else judgement.why,
         headline=f"found at {x:z.3f}, {y:z.3f}, {z:z.3f} m",

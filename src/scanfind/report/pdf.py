@@ -28,7 +28,7 @@ FONTS = (
 )
 DOTS = {
     "installed": "#2c7a57", "found": "#2c7a57", "in_tolerance": "#2c7a57", "not_found": "#b3261e",
-    "out_of_tolerance": "#b3261e", "uncertain": "#a8690f", "not_judged": "#a8690f",
+    "out_of_tolerance": "#b3261e", "uncertain": "#a8690f", "extra": "#a8690f", "not_judged": "#a8690f",
 }  # fmt: skip
 
 

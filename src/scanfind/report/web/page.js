@@ -81,9 +81,10 @@ function refresh() {
   if (!viewer) return;
   const c = (name) => colour(name);
   viewer.colours = {
+    __proto__: null, // a status may be called anything
     paper: c("--view"), in: c("--in"), none: c("--none"), scan: c("--scan"), design: c("--accent"),
     installed: c("--in"), found: c("--in"), in_tolerance: c("--in"), not_found: c("--out"), out_of_tolerance: c("--out"),
-    uncertain: c("--open"), not_judged: c("--open"), occluded: c("--none"), not_enough_data: c("--none"), no_data: c("--none"),
+    uncertain: c("--open"), extra: c("--open"), not_judged: c("--open"), occluded: c("--none"), not_enough_data: c("--none"), no_data: c("--none"),
   };
   const mm = viewer.limit * MM;
   $("limit-mm").textContent = `${mm.toFixed(1)} mm`;
