@@ -24,7 +24,7 @@ OF_DESIGN = (
 )  # fmt: skip
 OF_INSTANCES = (
     ("Instance", False), ("Status", False), ("Verdict", False), ("Score", True), ("x m", True), ("y m", True),
-    ("z m", True), ("Surface mm", True), ("Points", True),
+    ("z m", True), ("Surface mm", True),
 )  # fmt: skip
 
 
@@ -91,7 +91,7 @@ def _limit(content: Content, full: float) -> float:
 def _cells(item: Item, *, of_design: bool) -> list[Cell]:
     verdict = Cell(item.verdict_words, dot=item.verdict)
     named = [Cell(item.name), Cell(item.status_words, dot=item.status), verdict]
-    p95, points = _number(item.p95_m, 1e3), _number(None if item.found is None else float(item.found.points), 1.0, 0)
+    p95 = _number(item.p95_m, 1e3)
     if of_design:
         x, y, z = item.shift_m or (None, None, None)
         turn = None if item.turn_rad is None else degrees(item.turn_rad)
@@ -99,7 +99,7 @@ def _cells(item: Item, *, of_design: bool) -> list[Cell]:
         return [*named, *moved, _number(turn, 1.0, 2), p95]
     x, y, z = (row[3] for row in item.scene_from_model[:3]) if item.scene_from_model else (None, None, None)
     score = None if item.found is None else item.found.score
-    return [*named, _number(score, 1.0, 2), *(_number(value, 1.0, 3) for value in (x, y, z)), p95, points]
+    return [*named, _number(score, 1.0, 2), *(_number(value, 1.0, 3) for value in (x, y, z)), p95]
 
 
 def _number(value: float | None, factor: float, decimals: int = 1) -> Cell:
