@@ -123,7 +123,7 @@ def test_a_result_of_find_is_reported_by_its_instances(sound: Path, tmp_path: Pa
 
 def test_points_are_kept_to_a_65536th_of_their_box_and_deviations_to_a_127th(sound: Path, tmp_path: Path) -> None:
     content = written(sound, tmp_path / "a.html")
-    scene = scene_of(content.items, content.material, [])
+    scene = scene_of(content.items, content.material)
     positions = np.frombuffer(scene.positions, "<u2").reshape(-1, 3)
     values = np.frombuffer(scene.values, np.int8)
     assert len(positions) == len(values)

@@ -41,6 +41,11 @@ class Content:
         """What its items are, one or many."""
         return ("element" if self.of_design else "instance") + ("" if len(self.items) == 1 else "s")
 
+    @property
+    def stations(self) -> list[tuple[float, float, float]]:
+        """Where scanners stood, as far as anybody knows, scan frame, metres."""
+        return [place for scan in self.results.scans for place in scan.stations_m if place is not None]
+
     def counts(self) -> list[tuple[str, str, int]]:
         """How many items have which status and verdict: key, words, how many."""
         return counts_of(self.items)

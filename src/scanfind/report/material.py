@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -57,6 +58,13 @@ class Material:
     shapes: Mapping[str, Shape]
     around: Points
     notes: tuple[str, ...]
+
+    @cached_property
+    def all_points(self) -> Points:
+        """The scan around and all found points, each with how light it is."""
+        found = [Points(cloud.xyz, np.full(len(cloud.xyz), 0.5)) for cloud in self.points.values()]
+        clouds = [self.around, *found]
+        return Points(np.concatenate([c.xyz for c in clouds]), np.concatenate([c.values for c in clouds]))
 
 
 def gather(folder: Path, results: Results, models: Sequence[Model], scans: Sequence[Path], most: int) -> Material:

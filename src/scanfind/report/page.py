@@ -55,8 +55,7 @@ def page_of(content: Content) -> bytes:
     # Names come from files of strangers: what is not marked as ours is escaped.
     template = Environment(autoescape=True).from_string(_text("page.html"))
     style, script = _text("style.css"), '"use strict";\n(() => {\n' + "\n".join(map(_text, SCRIPTS)) + "})();\n"
-    stations = [place for scan in content.results.scans for place in scan.stations_m if place is not None]
-    scene = scene_of(content.items, content.material, stations)
+    scene = scene_of(content.items, content.material)
     facts = scene.facts | {"scale": SCALE, "limit": _limit(content, scene.facts["full"])}
     buffers = {"positions": scene.positions, "values": scene.values, "vertices": scene.vertices, "faces": scene.faces}
     page = template.render(

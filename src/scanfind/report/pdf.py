@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from scanfind.report.content import Content
     from scanfind.report.items import Item
 
-MOST_DETAILED = 150  # items with a page's half each: what has more is read on a screen
-PICTURE = (900, 560)  # pixels
+MOST_DETAILED = 100  # items with a page's half each: what has more is read on a screen
+PICTURE = (760, 470)  # pixels: 150 an inch
 SOFT, LINE = "#626a73", "#dfe1de"
 FONTS = (
     ("DejaVu", "DejaVu-Bold", ("DejaVuSans.ttf", "DejaVuSans-Bold.ttf")),
@@ -155,9 +155,8 @@ def _detail(content: Content, item: Item, full: float, style: dict[str, Any], wi
     if item.judgement and item.verdict != "in_tolerance":
         told.append(Paragraph(_safe(f"{item.verdict_words.capitalize()}: {item.verdict_why}."), style["text"]))
     # Nothing is to be seen of an element that stands in its place but for what a limit could not be held against.
-    stations = [place for scan in content.results.scans for place in scan.stations_m if place is not None]
     plain = item.verdict == NOT_JUDGED and item.status == INSTALLED
-    picture = None if plain else picture_of(item, content.material, stations, full, *PICTURE)
+    picture = None if plain else picture_of(item, content.material, content.stations, full, *PICTURE)
     if picture is not None:
         wide = 0.72 * width
         told += [Spacer(1, 4), Image(io.BytesIO(png(picture)), wide, wide * PICTURE[1] / PICTURE[0], hAlign="LEFT")]

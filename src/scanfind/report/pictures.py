@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 MODEL, MISSING, AROUND = (150, 163, 178), (214, 106, 96), (178, 178, 174)
-DOTS = 150_000  # of a surface: no pixel of it stays open
+DOTS = 100_000  # of a surface: no pixel of it stays open
 YIELD_M = 0.02  # by which a model yields to the points on it
+ROOM = 1.25  # so much more than the item is in its picture
 STEEPNESS = 0.45  # how much the view looks down, where nobody stood
 
 
@@ -33,13 +34,13 @@ def picture_of(
     if not len(seen):
         return None
     view = view_of(seen, stations, width / height)
-    around = material.around
+    around = material.all_points
     size = float(np.linalg.norm(np.ptp(seen, axis=0)))
     near = np.linalg.norm(around.xyz - seen.mean(axis=0), axis=1) < max(size, 0.5)
     # What would stand between the eye and the item is not drawn.
     near &= (around.xyz - seen.mean(axis=0)) @ view.forward > -0.5 * size
     light = (0.75 + 0.25 * around.values[near, None]) * np.array(AROUND)
-    return draw(view, [Dots(around.xyz[near], light.astype(np.uint8)), *layers], width, height)
+    return draw(view, [Dots(around.xyz[near], light.astype(np.uint8), 2, YIELD_M), *layers], width, height)
 
 
 def layers_of(item: Item, material: Material, full: float) -> tuple[list[Dots], Floats]:
@@ -73,4 +74,4 @@ def view_of(seen: Floats, stations: Sequence[tuple[float, float, float]], aspect
         towards[2] = np.clip(towards[2], -0.8 * flat, -0.25 * flat)
         if flat < 1e-6:
             towards = np.array([0.55, 0.75, -STEEPNESS])
-    return view_at(seen, towards, aspect=aspect)
+    return view_at(middle + ROOM * (seen - middle), towards, aspect=aspect)

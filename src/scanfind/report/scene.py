@@ -32,7 +32,7 @@ class Scene:
     facts: dict[str, Any]
 
 
-def scene_of(items: Sequence[Item], material: Material, stations: Sequence[tuple[float, float, float]]) -> Scene:
+def scene_of(items: Sequence[Item], material: Material) -> Scene:
     """The scene of a report; coordinates are taken from an origin near to it, which the facts name."""
     clouds = [*material.points.values(), material.around]
     corners = [cloud.xyz.mean(axis=0) for cloud in clouds if len(cloud.xyz)]
@@ -56,7 +56,6 @@ def scene_of(items: Sequence[Item], material: Material, stations: Sequence[tuple
         "origin": origin.tolist(),
         "full": float(full),
         "around": around,
-        "stations": [(np.array(station) - origin).tolist() for station in stations],
         "shapes": [
             {"vertices": len(v), "faces": len(f), "low": v.min(axis=0).tolist(), "high": v.max(axis=0).tolist()}
             for v, f in zip(vertices, faces, strict=True)
