@@ -20,8 +20,8 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [README, *(page.read_text(encoding="utf-8") for page in sorted((ROOT / "docs").glob("*.md")))]
 COMMANDS = [
-    ("find",), ("inspect",), ("isolate",), ("info",), ("library", "add"), ("library", "list"), ("library", "show"),
-    ("library", "remove"), ("simulate",),
+    ("find",), ("inspect",), ("report",), ("isolate",), ("info",), ("library", "add"), ("library", "list"),
+    ("library", "show"), ("library", "remove"), ("simulate",),
 ]  # fmt: skip
 # Enough for the examples to come to an end; how well they find is for other tests to say.
 TIME_LIMIT = "SCANFIND_SEARCH_TIME_LIMIT_S"
@@ -149,6 +149,7 @@ def test_the_examples_of_every_help_run(
         "library show",
         "find",
         "inspect",
+        "report",
         "isolate",
         "info",
         "library remove",

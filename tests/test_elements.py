@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import scanfind
+from by_hand import folder_by_hand
+from scanfind.again import isolate_again
 from scanfind.detection import Detection
 from scanfind.elements import (
     IN_TOLERANCE,
@@ -26,10 +29,12 @@ from scanfind.elements import (
     status_at,
 )
 from scanfind.free_space import Spoken
+from scanfind.library import ModelLibrary
 from scanfind.mesh import Mesh, Placement
 from scanfind.model import ModelParameters, build_model
 from scanfind.pose import Pose, random_rotation, rotation_from_vector, rotation_vector
 from scanfind.refine import held
+from scanfind.results import MODELS, read_results
 from scanfind.simulate.parts import blocks, box, cylinder
 from scanfind.simulate.scanner import Scanner, scan
 from scanfind.simulate.scene import Scene, SceneObject
@@ -208,3 +213,15 @@ def test_a_large_and_a_small_model_are_found_in_one_search() -> None:
     for one in found:
         truth = at(-1.5, 0.5) if one.model == "large" else at(0.3, -1.0, 0.0, 0.5)
         assert one.scene_from_model.difference(truth)[0] < 0.005
+
+
+def test_points_are_cut_again_without_losing_the_elements(tmp_path: Path) -> None:
+    folder = folder_by_hand(tmp_path / "inspected", points=500)
+    before = read_results(folder)
+    scans = [folder / str(found.isolated) for found in before.detections]
+    after = isolate_again(folder, scans, tolerance=0.003)
+    assert after.elements == before.elements
+    assert after.allowed_m == before.allowed_m
+    assert all(found.points < 500 for found in after.detections)
+    with ModelLibrary.open(folder / MODELS) as kept:
+        assert kept.names() == ["beam"]

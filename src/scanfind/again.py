@@ -51,7 +51,7 @@ def isolate_again(
     found, sources, clock = findings_of(before), Sources(list(scans)), Clock()
     with (
         result_folder(result_dir if out is None else out, overwrite=overwrite or out is None) as folder,
-        ModelLibrary.open(Path(result_dir) / MODELS) if found else ModelLibrary.in_memory() as models,
+        ModelLibrary.open(Path(result_dir) / MODELS) if found or found.elements else ModelLibrary.in_memory() as models,
         open_remainder(folder / before.remainder, scans) if before.remainder else nullcontext() as rest,
     ):
         with clock("isolate"):
@@ -62,6 +62,7 @@ def isolate_again(
             surfaces = surfaces_of(found, models.models(), within)
             findings = Findings(with_points(found, surfaces, {}, chunks, within, rest, available_cores()))
         findings.refused, findings.notes = found.refused, found.notes
+        findings.elements, findings.allowed_m = found.elements, found.allowed_m
         findings.shift, findings.crs, findings.tolerance_m = found.shift, found.crs, within
         # Where the scanner stood may have been told to the search by hand.
         stood = {scan.path: scan.stations for scan in found.scans}

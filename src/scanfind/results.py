@@ -141,8 +141,8 @@ def fill_folder(
             written += len(found.isolated)
             if progress is not None:
                 progress("write", written, total)
-    if findings:
-        _write_models(folder / MODELS, models, {found.model for found in findings})
+    if kept := {found.model for found in findings} | {each.model for each in findings.elements}:
+        _write_models(folder / MODELS, models, kept)
     results = document(
         findings, models=sought or model_entries(models), parameters=parameters, seed=seed, files=files,
         remainder=remainder,
@@ -200,11 +200,14 @@ def safe_name(name: str) -> str:
 
 
 def _write_models(path: Path, models: ModelLibrary, names: set[str]) -> None:
-    """The models found, so that their points can be cut again without the library that was searched."""
+    """The models found, so that their points can be cut again without the library that was searched, and the design's.
+
+    What an older result did not keep cannot be kept again.
+    """
     from scanfind.library import ModelLibrary
 
     with ModelLibrary.open(path, create=True) as kept:
-        for name in sorted(names):
+        for name in sorted(names.intersection(models.names())):
             kept.put(models.get(name))
 
 

@@ -17,6 +17,7 @@ from scanfind.cli.inspect import inspect
 from scanfind.cli.isolate import isolate
 from scanfind.cli.library import library
 from scanfind.cli.options import note
+from scanfind.cli.report import report
 from scanfind.cli.simulate import simulate
 from scanfind.errors import Interrupted, ScanfindError, UsageError
 
@@ -39,6 +40,7 @@ app.command(find, usage="scanfind find SCAN... (--model FILE... | --library LIB)
 app.command(inspect, usage="scanfind inspect SCAN... --design FILE... [OPTIONS]")
 app.command(library)
 app.command(isolate, usage="scanfind isolate RESULT_DIR SCAN... [OPTIONS]")
+app.command(report, usage="scanfind report RESULT_DIR [--out FILE...] [--tolerance PROFILE] [OPTIONS]")
 app.command(info, usage="scanfind info FILE... [--json]")
 app.command(simulate, usage="scanfind simulate SCENE (--out OUT | --plan) [OPTIONS]")
 
