@@ -182,6 +182,7 @@ class Findings(list[Detection]):
     tolerance_m : within which raw points were isolated, metres; None where they were not
     elements : of the design, what became of each; empty where that was not asked for
     allowed_m : by how much an element may be off, metres; None: nobody says
+    missing : scans that could not be read and were left out, and why
     """
 
     refused: list[Refused]
@@ -193,9 +194,10 @@ class Findings(list[Detection]):
     tolerance_m: float | None
     elements: list[Element]
     allowed_m: float | None
+    missing: list[str]
 
     def __init__(self, detections: list[Detection] | None = None) -> None:
         super().__init__(detections or [])
-        self.refused, self.scans, self.notes, self.elements = [], [], [], []
+        self.refused, self.scans, self.notes, self.elements, self.missing = [], [], [], [], []
         self.shift, self.crs, self.timings_s, self.tolerance_m = (0.0, 0.0, 0.0), None, {}, None
         self.allowed_m = None

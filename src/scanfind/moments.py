@@ -7,7 +7,7 @@ their pooled covariance its normals by PCA (3.2); moments add, so levels, chunks
 from __future__ import annotations
 
 import mmap
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial, reduce
 from typing import Any, TypeAlias
 
@@ -29,6 +29,11 @@ EMPTY_BLOCKS, EMPTY_ROWS = 1 << 16, 1 << 22
 MOST_SHARDS = 8  # each reads all points, and a thread that adds a tenth of them gains nothing any more
 WORTH_A_THREAD = 1000  # points or blocks: fewer are added sooner than a thread is started
 POINTS_TO_SETTLE = 1000  # of which the median says where the scan lies
+BLOCKS_AT_ONCE = 1024  # that leave a grid together: some 20 MB of rows
+
+# What leaves a grid, for a file or another grid with the same cells: the moments of one cell and view. Aligned, since
+# kernels read them.
+ROW = np.dtype([("key", "i8"), ("place", "i2"), ("view", "i2"), ("moments", "i8", (13,))], align=True)
 
 
 class MomentGrid:
@@ -93,6 +98,44 @@ class MomentGrid:
             ),
         )
         self.points += len(chunk)
+
+    def rows(self) -> Iterator[NDArray[Any]]:
+        """All moments, as rows (R,) of ROW, some blocks at a time in the order of their keys."""
+        blocks = self.blocks()
+        for start in range(0, len(blocks), BLOCKS_AT_ONCE):
+            some = blocks[start : start + BLOCKS_AT_ONCE]
+            first = self.block_rows[some].reshape(-1)
+            cells = np.flatnonzero(first >= 0)
+            rows = first[cells]
+            while len(rows):  # the first view of every cell, then the second of those that have one …
+                out = np.empty(len(rows), ROW)
+                out["key"], out["place"] = self.block_keys[some[cells // 512]], cells % 512
+                out["view"], out["moments"] = self.links[rows, 0], self.moments[rows]
+                yield out
+                following = self.links[rows, 1]
+                cells, rows = cells[following >= 0], following[following >= 0]
+
+    def add_rows(self, rows: NDArray[Any]) -> None:
+        """Sum rows (R,) of ROW into the grid, which must have the cells, offset and units of the one they left."""
+        from scanfind.kernels.grid import add_rows
+
+        keys, places, views, sums = (np.ascontiguousarray(rows[name]) for name in ROW.names or ())
+        self._in_shards(
+            len(rows),
+            lambda at, shard, arrays: add_rows(at, keys, places, views, sums, shard, self._shards, *arrays),
+        )
+        self.points += int(sums[:, 0].sum())
+
+    def look(self, beams: Iterable[Beams]) -> None:
+        """Take what scanners saw for what points of their own told: the nearest in each direction is kept."""
+        for of in beams:
+            key = (*of.origin.tolist(),)
+            self._beams[key] = np.minimum(self._beams[key], of.nearest) if key in self._beams else of.nearest
+
+    def memory_bytes(self) -> int:
+        """What the rows and blocks in use take."""
+        blocks, rows, _ = self.counts.sum(axis=0)
+        return int(blocks * self.block_rows[0].nbytes + rows * (self.moments[0].nbytes + self.links[0].nbytes))
 
     def _in_shards(self, count: int, work: Callable[[int, int, Arrays], int]) -> None:
         """Call work(at, shard, the shard's arrays) until each shard is at `count`, with more room where it stopped."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from scanfind import schema
-from scanfind.cloud import shift_for
+from scanfind.cloud import CHUNK_POINTS, shift_for
 from scanfind.document import document, model_entries
 from scanfind.errors import OutputError, UnreadableFileError
 
@@ -234,7 +234,10 @@ def _write_points(path: Path, instance: int, points: IsolatedPoints, findings: F
     }
     fields = {name: column.dtype for name, column in columns.items()}
     with open_writer(path, fields, shift=findings.shift, crs=findings.crs) as writer:
-        writer.write(points.xyz, columns)
+        # In pieces: the points of a tiled search are mapped from disk, and may be more than memory holds.
+        for start in range(0, max(len(points), 1), CHUNK_POINTS):
+            some = slice(start, start + CHUNK_POINTS)
+            writer.write(points.xyz[some], {name: column[some] for name, column in columns.items()})
 
 
 CSV_COLUMNS = (

@@ -18,6 +18,9 @@ from scanfind.errors import UnreadableFileError, UsageError
 Scan: TypeAlias = "str | PathLike[str] | PointCloud | NDArray[np.float64]"
 Floats = NDArray[np.float64]
 
+# What of a folder is a scan: .txt, .csv and .asc may be anything, and are read where they are named.
+FOLDER_SUFFIXES = (".e57", ".las", ".laz", ".ply", ".pcd", ".ptx", ".pts", ".xyz")
+
 
 @dataclass(eq=False)
 class Source:
@@ -34,6 +37,21 @@ class Source:
     dropped: int = 0
     stations: dict[int, tuple[float, float, float] | None] | None = None
 
+    def chunks(self, first_scan: int = 0) -> Iterator[PointChunk]:
+        """Every valid point, in order, its scans numbered from `first_scan` on. Counts what it passes."""
+        self.points = self.dropped = 0
+        self.stations = {}
+        for chunk in self.read():
+            self.points += len(chunk)
+            self.dropped += chunk.dropped
+            at = None if chunk.origin is None else (*(float(x) for x in chunk.origin),)
+            self.stations.setdefault(chunk.scan, at)  # type: ignore[arg-type]
+            yield replace(chunk, scan=chunk.scan + first_scan)
+
+    def scans(self) -> int:
+        """How many scan numbers it takes up, once it was read."""
+        return max(self.stations or {}, default=0) + 1
+
     def told(self) -> SceneScan:
         """What reading it told."""
         return SceneScan(self.path, self.points, self.dropped, tuple((self.stations or {}).values()))
@@ -43,15 +61,8 @@ class Sources:
     """All points of a scene, as often as they are asked for; `scan` numbers of chunks run on from file to file."""
 
     def __init__(self, scans: Scan | Sequence[Scan], origin: ArrayLike | None = None) -> None:
-        listed = [scans] if isinstance(scans, (str, PathLike, PointCloud, np.ndarray)) else list(scans)
-        if not listed:
-            msg = "find: no scan to search: give at least one scan file or point array"
-            raise UsageError(msg)
-        where = None if origin is None else np.asarray(origin, np.float64)
-        if where is not None and (where.shape != (3,) or not np.isfinite(where).all()):
-            msg = f"origin: the scanner position is three finite numbers, got {where.tolist()}"
-            raise UsageError(msg)
-        self.all = [source_of(scan, where, number) for number, scan in enumerate(listed)]
+        where = origin_of(origin)
+        self.all = [source_of(scan, where, number) for number, scan in enumerate(scans_of(scans))]
 
     def expected(self) -> int:
         """Records in all, -1 where only reading tells."""
@@ -62,19 +73,48 @@ class Sources:
         """Every valid point of every source, in order. Counts what it passes."""
         first_scan = 0
         for source in self.all:
-            source.points = source.dropped = 0
-            source.stations = {}
-            for chunk in source.read():
-                source.points += len(chunk)
-                source.dropped += chunk.dropped
-                at = None if chunk.origin is None else (*(float(x) for x in chunk.origin),)
-                source.stations.setdefault(chunk.scan, at)  # type: ignore[arg-type]
-                yield replace(chunk, scan=chunk.scan + first_scan)
-            first_scan += max(source.stations, default=0) + 1
+            yield from source.chunks(first_scan)
+            first_scan += source.scans()
 
     def crs(self) -> str | None:
         """The first coordinate reference system a source states."""
         return next((source.crs for source in self.all if source.crs), None)
+
+
+def scans_of(scans: Scan | Sequence[Scan]) -> list[Scan]:
+    """One by one: the scan files of a folder and those a pattern such as `setups/*.e57` names, sorted by name.
+
+    Raises UsageError where there is none.
+    """
+    listed = [scans] if isinstance(scans, (str, PathLike, PointCloud, np.ndarray)) else list(scans)
+    if not listed:
+        msg = "find: no scan to search: give at least one scan file or point array"
+        raise UsageError(msg)
+    return [one for scan in listed for one in (files_of(scan) if isinstance(scan, (str, PathLike)) else [scan])]
+
+
+def files_of(scan: str | PathLike[str]) -> list[str | PathLike[str]]:
+    """A file as it is; a folder's scan files, or those a pattern names, sorted."""
+    path = Path(scan)
+    if path.is_dir():
+        found = [file for file in path.iterdir() if file.suffix.lower() in FOLDER_SUFFIXES]
+        what = f"{path}: no scan file in this folder: scans end in {', '.join(FOLDER_SUFFIXES)}"
+    elif not path.exists() and set(path.name) & set("*?["):
+        found, what = list(path.parent.glob(path.name)), f"{path}: no file of such a name"
+    else:
+        return [scan]
+    if not found:
+        raise UsageError(what)
+    return [*sorted(found)]
+
+
+def origin_of(origin: ArrayLike | None) -> Floats | None:
+    """The door for a scanner position, (3,) or None; raises UsageError."""
+    where = None if origin is None else np.asarray(origin, np.float64)
+    if where is not None and (where.shape != (3,) or not np.isfinite(where).all()):
+        msg = f"origin: the scanner position is three finite numbers, got {where.tolist()}"
+        raise UsageError(msg)
+    return where
 
 
 def source_of(scan: Scan, origin: Floats | None, number: int) -> Source:

@@ -1,6 +1,7 @@
 """The command line: one library call a command. Data on stdout, words on stderr, errors in one line.
 
-Exit codes: 0 done, 1 error, 2 wrong call, 3 done but something was not found (only with --fail-on), 130 interrupted.
+Exit codes: 0 done, 1 error, 2 wrong call, 3 done but something was not found (only with --fail-on), 4 done
+but some of many scans could not be read, 130 interrupted.
 """
 
 from __future__ import annotations

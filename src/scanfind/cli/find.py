@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from scanfind.cli.options import Count, Flag, Format, Metres, Names, Paths, Position, Seconds, Units, note, say
-from scanfind.cli.outputs import NOT_AS_WANTED, results_of
+from scanfind.cli.outputs import NOT_AS_WANTED, SCANS_MISSING, results_of
 from scanfind.errors import UsageError
 
 if TYPE_CHECKING:
@@ -40,6 +40,10 @@ def find(
     parts: Flag = False,
     time_limit: Seconds | None = None,
     fail_on: Literal["not-found"] | None = None,
+    memory: str | None = None,
+    workers: Count | None = None,
+    scheduler: str | None = None,
+    resume: Flag = False,
 ) -> int:
     """Find every instance of every model in the scans; the files of several scans are one scene.
 
@@ -49,10 +53,12 @@ def find(
 
         scanfind find station1.laz station2.laz --library parts.scanfind --json
 
+        scanfind find station*.laz --library parts.scanfind --memory 3GB --out site
+
     Parameters
     ----------
     scans
-        Scan files: E57, LAS, LAZ, PLY, PCD, PTX, PTS, XYZ, CSV. They come before --model.
+        Scan files: E57, LAS, LAZ, PLY, PCD, PTX, PTS, XYZ, CSV, folders of them, or patterns. They come before --model.
     model
         Model files: STL, OBJ, PLY, GLB, OFF, 3MF, STEP, IFC, or a point cloud cut from a scan.
     library
@@ -93,6 +99,14 @@ def find(
         Search no longer than this, seconds.
     fail_on
         Exit with 3 if some model was not found.
+    memory
+        Search in tiles that fit a memory such as 3GB, of all workers together; a scan that cannot be read is left out.
+    workers
+        Search in tiles, with so many processes.
+    scheduler
+        Search in tiles, on the dask cluster of this address (tcp://...); --memory is then that of each worker.
+    resume
+        Go on with a search in tiles that ended early; what it had done lies beside --out.
 
     """
     if (model is None) == (library is None):
@@ -103,11 +117,13 @@ def find(
         raise UsageError(msg)
 
     from scanfind.cli.inputs import open_models
+    from scanfind.cli.tiled import Tiled
     from scanfind.config import load_settings
     from scanfind.find import find as find_models
     from scanfind.parameters import PRESETS
     from scanfind.progress import progress_on
     from scanfind.results import open_remainder, result_folder
+    from scanfind.sources import files_of
 
     flags = {
         "preset": preset, "seed": seed, "jobs": jobs, "units": units, "origin": origin, "format": format,
@@ -115,20 +131,29 @@ def find(
         "verify.min_score": min_score, "isolate.tolerance_m": tolerance, "assembly.parts": parts or None,
     }  # fmt: skip
     run, parameters = load_settings(PRESETS, flags, config)
+    files = [Path(file) for scan in scans for file in files_of(scan)]
+    tiled = Tiled.asked(memory, workers, scheduler, out, resume=resume, remainder=remainder)
     with ExitStack() as stack:
         folder = None if out is None else stack.enter_context(result_folder(out, overwrite=overwrite))
         models = stack.enter_context(open_models(model or [], library, run, parameters))
         progress = stack.enter_context(progress_on())
         rest = folder / f"remainder.{run.format}" if folder is not None and remainder else None
-        sink = None if rest is None else stack.enter_context(open_remainder(rest, scans))
-        findings = find_models(
-            scans, models, parameters=parameters, seed=run.seed, jobs=run.jobs, origin=run.origin,
-            progress=progress, remainder=sink,
-        )  # fmt: skip
+        sink = None if rest is None else stack.enter_context(open_remainder(rest, files))
+        if tiled is None:
+            findings = find_models(
+                files, models, parameters=parameters, seed=run.seed, jobs=run.jobs, origin=run.origin,
+                progress=progress, remainder=sink,
+            )  # fmt: skip
+        else:
+            findings = tiled.find(files, models, run, parameters, progress)
         results = results_of(findings, folder, models, run, parameters, progress, remainder=rest.name if rest else None)
+    if tiled is not None:
+        tiled.finished()
     report(results, out, json=json)
     missing = {entry.name for entry in results.models} - {found.model for found in results.detections}
-    return NOT_AS_WANTED if fail_on == "not-found" and missing else 0
+    if fail_on == "not-found" and missing:
+        return NOT_AS_WANTED
+    return SCANS_MISSING if findings.missing else 0
 
 
 def report(results: Results, out: Path | None, *, json: bool) -> None:

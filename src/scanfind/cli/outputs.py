@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from scanfind.schema import Results
 
 NOT_AS_WANTED = 3  # the exit code of --fail-on
+SCANS_MISSING = 4  # of a search in tiles that could not read some of many scans
 
 
 def results_of(

@@ -276,3 +276,33 @@ def sum_children(
                 add_child(moments, row, child_moments, child_row, ex, ey, ez)
                 child_row = np.int64(child_links[child_row, 1])
     return children.shape[0]
+
+
+@kernel
+def add_rows(
+    start, keys, places, views, sums, shard, shards,
+    hash_keys, hash_values, block_keys, block_cells, moments, links, counts,
+):  # fmt: skip
+    """Add rows[start:] of another grid with these cells to a shard's blocks; returns how far it came (see accumulate).
+
+    keys, places, views : (R,) the block, cell and view of each row; sums : (R, 13) its moments
+    """
+    most_blocks = room_for(block_keys.shape[0], np.int64(BLOCKS_A_LOT), shards)
+    most_rows = room_for(moments.shape[0], np.int64(ROWS_A_LOT), shards)
+    for i in range(start, keys.shape[0]):
+        key = keys[i]
+        if owner_of(key, shards) != shard:
+            continue
+        # Before anything is added: a row that is begun again must not count twice.
+        if counts[0] + 1 > most_blocks or counts[1] + 1 > most_rows:
+            return i
+        block = find_block(hash_keys, hash_values, key)
+        if block < 0:
+            block = add_block(hash_keys, hash_values, block_keys, block_cells, counts, shard, shards, key)
+        place, view = np.int64(places[i]), np.int64(views[i])
+        row = row_of_view(block_cells, links, block, place, view)
+        if row < 0:
+            row = add_row(block_cells, links, moments, counts, shard, shards, block, place, view)
+        for k in range(moments.shape[1]):
+            moments[row, k] += sums[i, k]
+    return keys.shape[0]

@@ -1,0 +1,327 @@
+"""What a worker does: sum a scan up, search a tile, cut a scan's points. Each task depends on its arguments alone."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.clock import Clock
+from scanfind.detection import Detection, IsolatedPoints, Refused, SceneScan
+from scanfind.errors import InvalidGeometryError, UnreadableFileError, UnsupportedFormatError
+from scanfind.find import recognise
+from scanfind.isolate import IsolateParameters, Isolator, Placed, joined, pieces_of
+from scanfind.moments import MomentGrid
+from scanfind.near_surface import near_model
+from scanfind.parameters import Parameters
+from scanfind.pose import Pose
+from scanfind.recognise import Standing
+from scanfind.scene import first_cell
+from scanfind.sizes import Size, Sizes, by_size
+from scanfind.sources import Scan, source_of
+from scanfind.tiles.plan import BASE_BYTES, Tile, bin_metres, margin_bins
+from scanfind.tiles.stored import Store, beams_into, parts_of, rows_in
+
+if TYPE_CHECKING:
+    from scanfind.kernels.distance import NearSurface
+    from scanfind.model import Model
+
+# A grid is written out when it takes a third of the memory: its arrays double, and a chunk of points lies beside it.
+GRID_SHARE = 1.0 / 3.0
+LEAST_GRID_BYTES = 50_000_000
+STATIONS_AT_ONCE = 16  # whose beams are held while a scan is summed up, 6 MB each
+# A tile also tells what it found so far beyond its border, in diameters: at the border itself two tiles may each think
+# that the middle of an instance lies with the other.
+RIM = 1.0 / 30.0
+
+
+@dataclass(frozen=True)
+class Job:
+    """What all tasks of a run share.
+
+    folder : the working folder, the same for all workers; the models lie in it
+    cell, offset : of every grid; blocks : log2 of the blocks along a bin's edge
+    memory : bytes a worker may take; jobs : its threads
+    """
+
+    folder: Path
+    cell: float
+    offset: tuple[float, float, float]
+    blocks: int
+    memory: int
+    jobs: int
+    parameters: Parameters
+    seed: int
+    origin: tuple[float, float, float] | None = None
+
+    def grid(self) -> MomentGrid:
+        """An empty one."""
+        return MomentGrid(self.cell, np.array(self.offset), self.jobs)
+
+    def models(self) -> list[Model]:
+        """The models sought, in the order given."""
+        return models_in(self.folder)
+
+    def bin_m(self) -> float:
+        """The edge of a bin, metres."""
+        return bin_metres(self.cell, self.blocks)
+
+
+class Summed(NamedTuple):
+    """What became of one scan. missing : why it could not be read; then nothing of it is used."""
+
+    told: SceneScan
+    scans: int
+    signed: bool
+    unaddressable: int
+    missing: str = ""
+
+
+class Searched(NamedTuple):
+    """What was found in one tile, its own or nearly so; see `own`.
+
+    noise, cell, reach : of the search, metres
+    """
+
+    detections: list[Detection]
+    refused: list[Refused]
+    notes: list[str]
+    noise: float
+    cell: float
+    reach: float
+
+
+class Cut(NamedTuple):
+    """Where the points of detections lie in a file of records: (detection, first byte, records, which of `dtypes`)."""
+
+    pieces: list[tuple[int, int, int, int]]
+    dtypes: list[np.dtype[Any]]
+    fields: dict[str, np.dtype[Any]]
+
+
+class Found(NamedTuple):
+    """An instance for others to respect, or to cut the points of."""
+
+    id: int
+    model: str
+    scene_from_model: Pose
+
+
+@lru_cache(maxsize=2)
+def models_in(folder: Path) -> list[Model]:
+    """The models of a run."""
+    with (folder / "models").open("rb") as file:
+        models: list[Model] = pickle.load(file)
+    return models
+
+
+@lru_cache(maxsize=256)
+def surface_of(folder: Path, name: str, reach: float) -> NearSurface:
+    """A model's surface, made once a worker."""
+    return near_model(next(model for model in models_in(folder) if model.name == name), reach)
+
+
+def sum_up(folder: Path, job: Job, scan: Scan, number: int) -> Summed:
+    """Pass over a scan once; its moments and beams lie in the folder then.
+
+    One that cannot be read is told, not raised: of fifty, the others are searched.
+    """
+    path = f"array {number}" if not isinstance(scan, (str, Path)) else str(scan)
+    store, grid, signed, left_out = Store(folder, job.blocks), job.grid(), True, 0
+    room, stations = max(LEAST_GRID_BYTES, GRID_SHARE * (job.memory - BASE_BYTES)), set[int]()
+    try:
+        source = source_of(scan, None if job.origin is None else np.array(job.origin), number)
+        for chunk in source.chunks():
+            if grid.memory_bytes() > room or len(stations | {chunk.scan}) > STATIONS_AT_ONCE:
+                store.write(grid)
+                left_out += grid.unaddressable
+                grid, stations = job.grid(), set()
+            stations.add(chunk.scan)
+            grid.add(chunk)
+            signed &= grid.signed
+    except (UnreadableFileError, UnsupportedFormatError, InvalidGeometryError) as error:
+        for part in folder.iterdir():
+            shutil.rmtree(part)
+        return Summed(SceneScan(path, 0, 0, ()), 1, True, 0, str(error))
+    store.write(grid)
+    return Summed(source.told(), source.scans(), signed, left_out + grid.unaddressable)
+
+
+def search(
+    folder: Path, job: Job, group: int, tile: Tile, standing: Sequence[Found], reach: float, signed: bool,
+    scans: Sequence[Path],
+) -> Searched:  # fmt: skip
+    """Search a tile, with its margin, for the models of one size.
+
+    standing : instances of larger models; reach : how far from their surface their points may lie, metres
+    scans : the folders of those summed up
+    """
+    models = by_size(job.models())[group]
+    own = replace(job.parameters, search=replace(job.parameters.search, max_instances=None))
+    grid = grid_of(job, models, tile, signed, scans)
+    taken = [Standing(surface_of(job.folder, one.model, reach), one.scene_from_model) for one in standing]
+    found = Sizes(models, own)
+    found.add(recognise(Size(models, 0, 1), grid, taken, own, job.seed, job.jobs, Clock(), _silent, at_design=False))
+    middles = {model.name: model.samples.points.mean(axis=0) for model in models}
+    diameters = {model.name: model.diameter for model in models}
+
+    def near(one: Detection | Refused) -> bool:
+        middle = one.scene_from_model.move(middles[one.model][None])[0] - job.offset
+        low, high = tile.metres(job.bin_m())
+        rim = RIM * diameters[one.model]
+        return bool(((middle >= low - rim) & (middle < high + rim)).all())
+
+    return Searched(
+        [one for one in found.detections() if near(one)], [one for one in found.refused() if near(one)], found.notes(),
+        found.noise(), found.cell(), found.all[0].reach(),
+    )  # fmt: skip
+
+
+def grid_of(job: Job, models: Sequence[Model], tile: Tile, signed: bool, scans: Sequence[Path]) -> MomentGrid:
+    """The moments of a tile with its margin, in the cells its models are searched with, and the beams into it."""
+    box = tile.grown(margin_bins(models, job.bin_m()))
+    parts = parts_of(scans)
+    cell, levels = cell_of(job, models)
+    grid = MomentGrid(cell, np.array(job.offset), job.jobs)
+    grid.units *= 2.0**levels
+    for rows in rows_in(parts, box):
+        for coarse in coarsened(job, rows, levels):
+            grid.add_rows(coarse)
+    grid.look(beams_into(parts, box.metres(job.bin_m())))
+    grid.signed = signed
+    return grid
+
+
+def coarsened(job: Job, rows: NDArray[Any], levels: int) -> Sequence[NDArray[Any]]:
+    """Rows (R,) of ROW in cells of 2**levels times the edge."""
+    if not levels:
+        return [rows]
+    grid = job.grid()
+    grid.add_rows(rows)
+    for _ in range(levels):
+        grid = grid.coarser()
+    return list(grid.rows())
+
+
+def cell_of(job: Job, models: Sequence[Model]) -> tuple[float, int]:
+    """The cell that models are searched with first, metres, and how many levels it is above the finest."""
+    wanted = first_cell([model.diameter for model in models], job.parameters.grid)
+    cell, levels = job.cell, 0
+    while 2.0 * cell <= wanted * (1.0 + 1e-9):
+        cell, levels = 2.0 * cell, levels + 1
+    return cell, levels
+
+
+def own(searched: Mapping[Tile, Searched], job: Job) -> list[Detection]:
+    """The detections of all tiles, each instance once, in the order of the tiles.
+
+    Of two tiles that tell the same instance the one in whose half-open box its middle lies is believed.
+    """
+    every = [(tile, one) for tile, found in sorted(searched.items()) for one in found.detections]
+    mine = {id(one): _inside(tile, one, job) for tile, one in every}
+    diameters = {model.name: model.diameter for model in job.models()}
+    kept: list[tuple[Tile, Detection]] = []
+    for tile, one in sorted(every, key=lambda pair: not mine[id(pair[1])]):
+        middle, rim = np.array(one.pivot), RIM * diameters[one.model]
+        if not any(
+            other.model == one.model and there != tile and np.linalg.norm(np.array(other.pivot) - middle) < rim
+            for there, other in kept
+        ):
+            kept.append((tile, one))
+    order = {id(one): place for place, (_, one) in enumerate(every)}
+    return sorted((one for _, one in kept), key=lambda one: order[id(one)])
+
+
+def _inside(tile: Tile, one: Detection, job: Job) -> bool:
+    low, high = tile.metres(job.bin_m())
+    middle = np.array(one.pivot) - job.offset
+    return bool(((middle >= low) & (middle < high)).all())
+
+
+def cut(folder: Path, job: Job, scan: Scan, number: int, found: Sequence[Found], tolerance: float, first: int) -> Cut:
+    """Pass over a scan once more; the points of detections lie in the folder then, in the order of the file.
+
+    first : the number of its first scan among all
+    """
+    placed = [Placed(one.id, surface_of(job.folder, one.model, tolerance), one.scene_from_model) for one in found]
+    isolator = Isolator(placed, IsolateParameters(tolerance), jobs=job.jobs)
+    source = source_of(scan, None if job.origin is None else np.array(job.origin), number)
+    pieces: list[tuple[int, int, int, int]] = []
+    dtypes: list[np.dtype[Any]] = []
+    fields: dict[str, np.dtype[Any]] = {}
+    with (folder / "points").open("wb") as file:
+        for chunk in source.chunks(first):
+            for name, values in chunk.attributes.items():
+                fields[name] = np.promote_types(fields.get(name, values.dtype), values.dtype)
+            for key, points in pieces_of(chunk, *isolator.cut(chunk)):
+                records = packed(points)
+                if records.dtype not in dtypes:
+                    dtypes.append(records.dtype)
+                pieces.append((key, file.tell(), len(records), dtypes.index(records.dtype)))
+                file.write(records.view(np.uint8).data)
+    return Cut(pieces, dtypes, fields)
+
+
+OURS = (("xyz", "f8", (3,)), ("source_index", "i8"), ("scan_id", "i4"), ("deviation", "f4"))
+
+
+def packed(points: IsolatedPoints) -> NDArray[Any]:
+    """Points as records (N,); attributes are numbered after ours, since their names may be anything."""
+    attributes = [(f"a:{name}", values.dtype) for name, values in points.attributes.items()]
+    records = np.empty(len(points), np.dtype([*OURS, *attributes]))
+    for name in ("xyz", "source_index", "scan_id", "deviation"):
+        records[name] = getattr(points, name)
+    for name, values in points.attributes.items():
+        records[f"a:{name}"] = values
+    return records
+
+
+def unpacked(records: NDArray[Any]) -> IsolatedPoints:
+    """Records (N,) as points."""
+    columns = {name: np.ascontiguousarray(records[name]) for name in records.dtype.names or ()}
+    attributes = {name.removeprefix("a:"): values for name, values in columns.items() if name.startswith("a:")}
+    return IsolatedPoints(columns["xyz"], attributes, columns["scan_id"], columns["source_index"], columns["deviation"])
+
+
+def gathered(cuts: Sequence[tuple[Path, Cut]], key: int) -> IsolatedPoints:
+    """The points of one detection from all scans, in their order."""
+    pieces: list[IsolatedPoints] = []
+    fields: dict[str, np.dtype[Any]] = {}
+    for folder, told in cuts:
+        for name, dtype in told.fields.items():
+            fields[name] = np.promote_types(fields.get(name, dtype), dtype)
+        with (folder / "points").open("rb") as file:
+            for of, start, count, kind in told.pieces:
+                if of == key:
+                    file.seek(start)
+                    pieces.append(unpacked(np.fromfile(file, told.dtypes[kind], count)))
+    return joined(pieces, fields)
+
+
+def on_disk(points: IsolatedPoints, folder: Path) -> IsolatedPoints:
+    """The same points, mapped from files: those of all detections of a site may be more than memory holds."""
+    if not len(points):
+        return points
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def mapped(name: str, values: NDArray[Any]) -> NDArray[Any]:
+        np.save(folder / f"{name}.npy", values)
+        array: NDArray[Any] = np.load(folder / f"{name}.npy", mmap_mode="r")
+        return array
+
+    attributes = {name: mapped(f"attribute{k}", values) for k, (name, values) in enumerate(points.attributes.items())}
+    return IsolatedPoints(
+        mapped("xyz", points.xyz), attributes, mapped("scan_id", points.scan_id),
+        mapped("source_index", points.source_index), mapped("deviation", points.deviation),
+    )  # fmt: skip
+
+
+def _silent(stage: str, done: float, total: float) -> None:
+    pass

@@ -1,0 +1,46 @@
+"""Who does the work: processes of this machine, or a dask cluster. Both are executors of concurrent.futures."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from concurrent.futures import Executor, ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import Any
+
+from scanfind.errors import MissingExtraError, UsageError, require
+
+
+def processes(count: int) -> Callable[[], Executor]:
+    """What makes a pool of so many processes, anew each time: one that is killed breaks its pool."""
+    require(count >= 1, "workers", count, "1 or more")
+    # Spawned: a fork of a process with threads in compiled code may never come back.
+    return lambda: ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_end_quietly)
+
+
+def cluster(address: str) -> Callable[[], Executor]:
+    """What connects to a dask scheduler, such as `tcp://host:8786`, and gives its executor.
+
+    Raises MissingExtraError without dask, UsageError where no scheduler answers.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        msg = "--scheduler needs dask: pip install 'scanfind[dask]'"
+        raise MissingExtraError(msg) from error
+
+    def connected() -> Executor:
+        try:
+            client = Client(address)
+        except (OSError, ValueError) as error:
+            msg = f"--scheduler {address}: no dask scheduler answers there: {' '.join(str(error).split())}"
+            raise UsageError(msg) from error
+        executor: Any = client.get_executor(pure=False)
+        return executor  # type: ignore[no-any-return]
+
+    return connected
+
+
+def _end_quietly() -> None:
+    """Ctrl-C reaches every process of a terminal: the one a person started tells of it, and its workers just end."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)

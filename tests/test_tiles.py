@@ -1,0 +1,224 @@
+"""A site in tiles: the same as in one piece, whoever does the work and whatever dies on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from scanfind.cloud import PointChunk, PointCloud
+from scanfind.detection import Findings
+from scanfind.errors import UnreadableFileError, UsageError
+from scanfind.find import find
+from scanfind.moments import ROW, MomentGrid
+from scanfind.scans import open_writer
+from scanfind.tiles import find_in_tiles
+from scanfind.tiles import plan as planned
+from scanfind.tiles.plan import BASE_BYTES, ROW_BYTES, STATION_BYTES, Tile, size_of, tiles_of
+from scanfind.tiles.workers import processes
+from test_find import BRACKET, QUICK, Floats, clouds, library
+
+# A corridor of rooms, of which no tile may hold more than about one and a half.
+ROOMS = 3
+APART = np.array([6.0, 0.4, 0.0])
+ROWS_A_TILE = 250_000
+
+
+@cache
+def corridor() -> list[PointCloud]:
+    """Rooms with a bracket each, every second point of each station."""
+    return [
+        replace(
+            cloud, xyz=cloud.xyz[::2] + k * APART, origin=None if cloud.origin is None else cloud.origin + k * APART,
+            attributes={name: values[::2] for name, values in cloud.attributes.items()},
+        )
+        for k in range(ROOMS)
+        for cloud in clouds()
+    ]  # fmt: skip
+
+
+def memory_for(rows: int) -> int:
+    return BASE_BYTES + 2 * ROOMS * STATION_BYTES + ROW_BYTES * rows
+
+
+@pytest.fixture
+def narrow(monkeypatch: pytest.MonkeyPatch) -> int:
+    """A memory in which the corridor is no single tile; the rooms have less surface than the estimate expects."""
+    monkeypatch.setattr(planned, "ROWS_A_SQUARE_CELL", 1.0)
+    return memory_for(ROWS_A_TILE)
+
+
+def in_tiles(memory: int, executor: Executor | Callable[[], Executor] | None = None, **rest: object) -> Findings:
+    return find_in_tiles(corridor(), library(), parameters=QUICK, memory=memory, executor=executor, **rest)  # type: ignore[arg-type]
+
+
+SAID: list[str] = []
+TILES: list[str] = []
+
+
+@cache
+def serial() -> Findings:
+    """In this process; SAID and TILES hold what was said, and the names of the tiles."""
+    with pytest.MonkeyPatch.context() as patch, TemporaryDirectory() as work:
+        patch.setattr(planned, "ROWS_A_SQUARE_CELL", 1.0)
+        found = in_tiles(memory_for(ROWS_A_TILE), work=work, say=SAID.append)
+        TILES.extend(path.name for path in Path(work).glob("search-*"))
+        return found
+
+
+def places(found: Findings) -> Floats:
+    return np.array(sorted((one.pivot or (np.nan,) * 3 for one in found), key=lambda at: at[0]))
+
+
+def assert_same(one: Findings, other: Findings) -> None:
+    """To the last bit."""
+    assert [found.model for found in one] == [found.model for found in other]
+    for mine, theirs in zip(one, other, strict=True):
+        np.testing.assert_array_equal(mine.scene_from_model.matrix(), theirs.scene_from_model.matrix())
+        assert (mine.id, mine.score, mine.support, mine.deviation) == (
+            theirs.id, theirs.score, theirs.support, theirs.deviation,
+        )  # fmt: skip
+        assert mine.isolated is not None
+        assert theirs.isolated is not None
+        np.testing.assert_array_equal(mine.isolated.xyz, theirs.isolated.xyz)
+        np.testing.assert_array_equal(mine.isolated.scan_id, theirs.isolated.scan_id)
+        np.testing.assert_array_equal(mine.isolated.source_index, theirs.isolated.source_index)
+        np.testing.assert_array_equal(mine.isolated.deviation, theirs.isolated.deviation)
+        assert mine.isolated.attributes.keys() == theirs.isolated.attributes.keys()
+        for name, values in mine.isolated.attributes.items():
+            np.testing.assert_array_equal(values, theirs.isolated.attributes[name])
+    assert (one.scans, one.tolerance_m, one.shift, one.crs) == (
+        other.scans, other.tolerance_m, other.shift, other.crs,
+    )  # fmt: skip
+
+
+@cache
+def whole() -> Findings:
+    return find(corridor(), library(), parameters=QUICK)
+
+
+def test_one_tile_is_find() -> None:
+    assert_same(find_in_tiles(clouds(), library(), parameters=QUICK), find(clouds(), library(), parameters=QUICK))
+
+
+def test_tiles_are_the_whole() -> None:
+    assert len(whole()) == len(serial()) == ROOMS
+    assert len(TILES) >= ROOMS
+    # Each tile searched on its own; the last fit, on the raw points, leaves a hundredth of a millimetre.
+    np.testing.assert_allclose(places(serial()), places(whole()), atol=5e-5)
+    points = [sorted(len(one.isolated or ()) for one in found) for found in (serial(), whole())]
+    np.testing.assert_allclose(points[0], points[1], rtol=0.01)
+
+
+def test_threads_do_the_same(narrow: int) -> None:
+    with ThreadPoolExecutor(3) as pool:
+        assert_same(in_tiles(narrow, pool), serial())
+
+
+@pytest.mark.slow
+def test_processes_do_the_same(narrow: int) -> None:
+    assert_same(in_tiles(narrow, processes(2)), serial())
+
+
+def test_a_memory_that_cannot_be_kept_is_refused_before_a_point_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scanfind.sources.chunks_of", lambda cloud: pytest.fail("it was read"))
+    with pytest.raises(UsageError, match=r"--memory 500 MB cannot be kept: the smallest tile .* needs about"):
+        in_tiles(500_000_000)
+
+
+def test_what_a_run_takes_is_told_before_it_and_each_scan_as_it_comes() -> None:
+    serial()
+    points = sum(len(cloud) for cloud in corridor())
+    assert SAID[0].startswith(f"{points:,} points; memory: ")
+    assert sum("M points/s" in line for line in SAID) == len(corridor())
+
+
+def test_of_many_scans_one_that_cannot_be_read_is_left_out(tmp_path: Path) -> None:
+    cut_short, files = tmp_path / "b.ply", []
+    for name, cloud in zip("abc", [*clouds(), clouds()[0]], strict=True):
+        files.append(tmp_path / f"{name}.ply")
+        with open_writer(files[-1], {}) as writer:
+            writer.write(cloud.xyz, {})
+    cut_short.write_bytes(cut_short.read_bytes()[:-1000])
+    origin = clouds()[0].origin
+    found = find_in_tiles(tmp_path, library(), parameters=QUICK, origin=origin)
+    assert len(found) == 1
+    assert len(found.missing) == 1
+    assert str(cut_short) in found.missing[0]
+    assert found.missing[0] in found.notes
+    assert [scan.points for scan in found.scans] == [len(clouds()[0]), 0, len(clouds()[0])]
+    alone = find_in_tiles([files[0], files[2]], library(), parameters=QUICK, origin=origin)
+    np.testing.assert_array_equal(alone[0].scene_from_model.matrix(), found[0].scene_from_model.matrix())
+
+
+def test_where_no_scan_can_be_read_the_first_error_is_told(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_bytes(b"ply\n")
+    with pytest.raises(UnreadableFileError, match=r"a\.ply"):
+        find_in_tiles(tmp_path, BRACKET, parameters=QUICK)
+
+
+boxes = st.lists(st.tuples(*[st.integers(-6, 6)] * 3), min_size=1, max_size=40, unique=True)
+
+
+@given(boxes, st.integers(0, 2), st.integers(60, 400))
+def test_every_bin_has_one_tile_and_no_tile_too_much(bins: list[tuple[int, int, int]], margin: int, most: int) -> None:
+    every = np.array(bins, np.int64)
+    rows = np.arange(1, len(bins) + 1)
+    try:
+        tiles = tiles_of(every, rows, margin, most)
+    except UsageError:
+        assert any(rows[Tile(one, (one[0] + 1, one[1] + 1, one[2] + 1)).grown(margin).holds(every)].sum() > most
+                   for one in bins)  # fmt: skip
+        return
+    np.testing.assert_array_equal(sum(tile.holds(every).astype(int) for tile in tiles), 1)
+    assert all(rows[tile.grown(margin).holds(every)].sum() <= most for tile in tiles)
+    assert tiles == tiles_of(every[::-1], rows[::-1], margin, most)
+
+
+def summed_grid(points: Sequence[Floats], jobs: int) -> MomentGrid:
+    grid = MomentGrid(0.05, np.zeros(3), jobs)
+    for k, xyz in enumerate(points):
+        grid.add(PointChunk(xyz, {}, np.arange(len(xyz)), origin=np.array([5.0 * k, 1.0, 2.0])))
+    return grid
+
+
+def all_rows(grid: MomentGrid) -> Floats:
+    rows = np.concatenate([np.empty(0, ROW), *grid.rows()])
+    return np.sort(rows, order=["key", "place", "view"])
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_moments_that_left_two_grids_make_the_grid_of_both(jobs: int) -> None:
+    rng = np.random.default_rng(3)
+    halves = [rng.uniform(-2, 2, (30_000, 3)), rng.uniform(-1, 3, (30_000, 3))]
+    both = summed_grid(halves, jobs)
+    joined = MomentGrid(0.05, np.zeros(3), jobs)
+    for half in (summed_grid([halves[0]], 2), summed_grid([halves[0][:0], halves[1]], 1)):
+        for rows in half.rows():
+            joined.add_rows(rows)
+        joined.look(half.beams())
+    assert joined.points == both.points
+    np.testing.assert_array_equal(all_rows(joined), all_rows(both))
+    np.testing.assert_array_equal(all_rows(joined.coarser()), all_rows(both.coarser()))
+    for mine, theirs in zip(joined.beams(), both.beams(), strict=True):
+        np.testing.assert_array_equal(mine.origin, theirs.origin)
+        np.testing.assert_array_equal(mine.nearest, theirs.nearest)
+
+
+@pytest.mark.parametrize(("text", "size"), [("3GB", 3e9), ("800 MB", 8e8), ("1.5g", 1.5e9), ("2GiB", 2**31), ("7", 7)])
+def test_sizes(text: str, size: float) -> None:
+    assert size_of(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "GB", "-3GB", "3 apples", "0"])
+def test_what_is_no_size(text: str) -> None:
+    with pytest.raises(UsageError, match="--memory is a size"):
+        size_of(text)
