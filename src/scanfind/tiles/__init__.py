@@ -66,7 +66,7 @@ from scanfind.tiles.tasks import (
     sum_up,
     surface_of,
 )
-from scanfind.tiles.work import Here, Workers, all_done, no_room, opened
+from scanfind.tiles.work import Crew, Here, Workers, all_done, no_room, opened
 
 if TYPE_CHECKING:
     from scanfind.detection import Detection, Refused
@@ -130,8 +130,11 @@ def find_in_tiles(
         if work is None:
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
         try:
-            return _find(folder, listed, library, executor or Here(), memory, parameters, seed,
-                         jobs or available_cores(), clock, tell, say, resume=resume or work is None)  # fmt: skip
+            crew = stack.enter_context(Crew(executor or Here()))
+            return _find(
+                folder, listed, library, crew, memory, parameters, seed, jobs or available_cores(), clock, tell, say,
+                resume=resume or work is None,
+            )  # fmt: skip
         except KeyboardInterrupt as error:
             if work is None:
                 raise
@@ -140,7 +143,7 @@ def find_in_tiles(
 
 
 def _find(
-    folder: Path, listed: Listed, library: list[Model], workers: Workers, memory: int, parameters: Parameters,
+    folder: Path, listed: Listed, library: list[Model], crew: Crew, memory: int, parameters: Parameters,
     seed: int, jobs: int, clock: Clock, tell: Progress, say: Callable[[str], None], *, resume: bool,
 ) -> Findings:  # fmt: skip
     sizes = Sizes(library, parameters)
@@ -153,14 +156,14 @@ def _find(
     with clock("read"):
         job = replace(job, offset=offset_of(listed, cell))
     with clock("grid"):
-        summed = sum_all_up(job, listed, workers, tell, say)
+        summed = sum_all_up(job, listed, crew, tell, say)
         folders = [folder / scan_name(k) for k, one in enumerate(summed) if not one.missing]
         bins, rows = rows_by_bin(parts_of(folders))
 
     findings, searched, largest = Findings(), list[Searched](), None
     for group, size in enumerate(sizes.groups()):
         with clock("search"):
-            found = search_all(job, group, size.models, bins, rows, summed, folders, findings, searched, workers, tell)
+            found = search_all(job, group, size.models, bins, rows, summed, folders, findings, searched, crew, tell)
             findings.extend(own(found, job))
             searched += found.values()
             largest = largest or next((one for one in typical(found) if one.detections), None)
@@ -172,7 +175,7 @@ def _find(
             one = largest or searched[-1]
             tolerance = isolation_tolerance(parameters.isolate, one.noise, one.cell)
             findings.tolerance_m = tolerance
-            findings[:] = isolate_all(job, listed, findings, tolerance, summed, workers, clock, tell)
+            findings[:] = isolate_all(job, listed, findings, tolerance, summed, crew, clock, tell)
     findings.scans, findings.crs = [one.told for one in summed], listed.crs()
     findings.missing = [f"{one.told.path} was left out: {one.missing}" for one in summed if one.missing]
     left_out = sum(one.unaddressable for one in summed)
@@ -237,7 +240,7 @@ def offset_of(listed: Listed, cell: float) -> tuple[float, float, float]:
     return x, y, z
 
 
-def sum_all_up(job: Job, listed: Listed, workers: Workers, tell: Progress, say: Callable[[str], None]) -> list[Summed]:
+def sum_all_up(job: Job, listed: Listed, crew: Crew, tell: Progress, say: Callable[[str], None]) -> list[Summed]:
     """Every scan, summed up; those that cannot be read are told. Raises UnreadableFileError where none can."""
     began, points, done, expected = time.monotonic(), 0, 0, listed.expected()
     count = len(listed.all)
@@ -254,7 +257,7 @@ def sum_all_up(job: Job, listed: Listed, workers: Workers, tell: Progress, say: 
         say(f"{done} of {count}: {Path(one.told.path).name}: {what} ({rate:.1f} M points/s{left})")
 
     tasks = {scan_name(k): (sum_up, job, source.scan, k) for k, source in enumerate(listed.all)}
-    summed: list[Summed] = all_done(job.folder, workers, tasks, told)
+    summed: list[Summed] = all_done(job.folder, crew, tasks, told)
     if not any(one.told.points for one in summed):
         raise UnreadableFileError(next((one.missing for one in summed if one.missing), "no valid point in any scan"))
     say(f"{points:,} points in {time.monotonic() - began:.0f} s; {stored_words(job, listed)} on disk")
@@ -270,7 +273,7 @@ def stored_words(job: Job, listed: Listed) -> str:
 
 def search_all(
     job: Job, group: int, models: list[Model], bins: Ints, rows: Ints, summed: list[Summed],
-    folders: list[Path], standing: Sequence[Detection], searched: list[Searched], workers: Workers, tell: Progress,
+    folders: list[Path], standing: Sequence[Detection], searched: list[Searched], crew: Crew, tell: Progress,
 ) -> dict[Tile, Searched]:  # fmt: skip
     """What every tile of the site holds of the models of one size."""
     _, levels = cell_of(job, models)
@@ -290,7 +293,7 @@ def search_all(
         done += 1
         tell("search", done, len(tiles))
 
-    return dict(zip(tiles, all_done(job.folder, workers, tasks, told), strict=True))
+    return dict(zip(tiles, all_done(job.folder, crew, tasks, told), strict=True))
 
 
 def typical(found: dict[Tile, Searched]) -> list[Searched]:
@@ -318,7 +321,7 @@ def closest(searched: Sequence[Searched]) -> list[Refused]:
 
 
 def isolate_all(
-    job: Job, listed: Listed, findings: Findings, tolerance: float, summed: list[Summed], workers: Workers,
+    job: Job, listed: Listed, findings: Findings, tolerance: float, summed: list[Summed], crew: Crew,
     clock: Clock, tell: Progress,
 ) -> list[Detection]:  # fmt: skip
     """Every detection with its raw points, on disk, and fitted to them."""
@@ -333,7 +336,7 @@ def isolate_all(
         done += summed[int(name.rpartition("-")[2])].told.points
         tell("isolate", done, expected)
 
-    cuts = list(zip([job.folder / name for name in tasks], all_done(job.folder, workers, tasks, told), strict=True))
+    cuts = list(zip([job.folder / name for name in tasks], all_done(job.folder, crew, tasks, told), strict=True))
     measured = []
     for one in findings:
         cut_out = gathered(cuts, one.id)

@@ -6,13 +6,13 @@ import json
 import os
 import pickle
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from concurrent.futures import CancelledError as TaskCancelled
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
-from scanfind.errors import OutputError, ScanfindError, UsageError
+from scanfind.errors import OutputError, UsageError
 
 Outcome = TypeVar("Outcome")
 # An executor, or what makes one anew: a pool of processes is broken when one of them is killed.
@@ -84,13 +84,40 @@ def kept(folder: Path, name: str, work: Callable[..., Outcome], *arguments: Any)
     return outcome
 
 
+class Crew:
+    """Workers for a run. Those made for it are made anew when one of them dies, and closed at the end."""
+
+    def __init__(self, workers: Workers) -> None:
+        self._workers = workers
+        self._pool = workers if isinstance(workers, Executor) else None
+
+    def pool(self) -> Executor:
+        """Whom to give tasks to."""
+        if self._pool is None:
+            assert not isinstance(self._workers, Executor)
+            self._pool = self._workers()
+        return self._pool
+
+    def renew(self) -> bool:
+        """Others in the place of those that died; False where they were given, and are not ours to replace."""
+        if isinstance(self._workers, Executor):
+            return False
+        self.__exit__()
+        return True
+
+    def __enter__(self) -> Crew:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        if self._pool is not None and self._pool is not self._workers:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+            self._pool = None
+
+
 def all_done(
-    folder: Path,
-    workers: Workers,
-    tasks: Mapping[str, tuple[Any, ...]],
-    told: Callable[[str, Any], None] = lambda *_: None,
+    folder: Path, crew: Crew, tasks: Mapping[str, tuple[Any, ...]], told: Callable[[str, Any], None] = lambda *_: None
 ) -> list[Any]:
-    """The outcomes of tasks, in their order: those done before are read, the others given to the workers.
+    """The outcomes of tasks, in their order: those done before are read, the others given to the crew.
 
     tasks : name → function and arguments, see `kept`
     told : is called with the name and outcome of each as it comes
@@ -106,15 +133,13 @@ def all_done(
         if (folder / name / DONE).is_file():
             with (folder / name / DONE).open("rb") as file:
                 take(name, pickle.load(file))  # our own, written by `kept`
-    for attempt in range(ATTEMPTS):
-        missing = [name for name in tasks if name not in outcomes]
-        if not missing:
-            break
+    attempt = 0
+    while missing := [name for name in tasks if name not in outcomes]:
         try:
-            with borrowed(workers) as pool:
-                _run(pool, folder, {name: tasks[name] for name in missing}, take)
+            _run(crew.pool(), folder, {name: tasks[name] for name in missing}, take)
         except BrokenExecutor as error:
-            if isinstance(workers, Executor) or attempt == ATTEMPTS - 1:
+            attempt += 1
+            if attempt == ATTEMPTS or not crew.renew():
                 msg = f"workers died, last of all during {missing[0]}: give them more memory, and --resume to go on"
                 raise OutputError(msg) from error
     return [outcomes[name] for name in tasks]
@@ -122,46 +147,36 @@ def all_done(
 
 def _run(pool: Executor, folder: Path, tasks: Mapping[str, tuple[Any, ...]], take: Callable[[str, Any], None]) -> None:
     names: dict[Future[Any], str] = {}
+    left: set[Future[Any]] = set()
+
+    def take_those(ended: set[Future[Any]]) -> None:
+        left.difference_update(ended)
+        for future in sorted(ended, key=lambda one: names[one]):
+            take(names[future], outcome_of(future))
+
     try:
         for name, task in tasks.items():
-            names[pool.submit(kept, folder, name, *task)] = name
-        left = set(names)
+            future = pool.submit(kept, folder, name, *task)
+            names[future] = name
+            left.add(future)
+            take_those({one for one in left if one.done()})  # a serial executor has done it by now
         while left:
-            ended, left = wait(left, return_when=FIRST_COMPLETED)
-            for future in sorted(ended, key=lambda one: names[one]):
-                take(names[future], outcome_of(future))
+            take_those(wait(left, return_when=FIRST_COMPLETED).done)
     finally:
         for future in names:
             future.cancel()
 
 
 def outcome_of(future: Future[Any]) -> Any:
-    """What a task gave; raises what it raised, where that is ours or the pool's, else one line of it."""
+    """What a task gave; raises what it raised, and one line for what befell a cluster."""
     try:
         return future.result()
-    except (ScanfindError, BrokenExecutor, MemoryError):
-        raise
     except (Exception, TaskCancelled) as error:
-        if type(error).__module__.startswith("distributed"):  # KilledWorker, CommClosedError: the cluster's troubles
-            msg = f"the cluster gave up on a task ({type(error).__name__}): see its log, and give --resume to go on"
-            raise OutputError(msg) from error
-        raise
-
-
-class borrowed:  # noqa: N801 - a context manager, read as a word
-    """Workers for a while: those given stay open, those made for this are closed."""
-
-    def __init__(self, workers: Workers) -> None:
-        self._own = None if isinstance(workers, Executor) else workers()
-        self._pool = workers if isinstance(workers, Executor) else self._own
-
-    def __enter__(self) -> Executor:
-        assert self._pool is not None
-        return self._pool
-
-    def __exit__(self, *raised: object) -> None:
-        if self._own is not None:
-            self._own.shutdown(wait=True, cancel_futures=True)
+        if not type(error).__module__.startswith(("distributed", "concurrent.futures._base")):
+            raise
+        # KilledWorker, CommClosedError, a task cancelled because its scheduler is gone.
+        msg = f"the cluster gave up on a task ({type(error).__name__}): see its log, and give --resume to go on"
+        raise OutputError(msg) from error
 
 
 def no_room(folder: Path, error: OSError) -> OutputError:
@@ -169,8 +184,3 @@ def no_room(folder: Path, error: OSError) -> OutputError:
     # NumPy says how many items it wrote, and not why it was no more.
     why = error.strerror or "no room left on the disk"
     return OutputError(f"{folder}: {why}: make room, then give --resume to go on with what is done")
-
-
-def folders_of(folder: Path, names: Sequence[str]) -> list[Path]:
-    """Where tasks left what they wrote."""
-    return [folder / name for name in names]

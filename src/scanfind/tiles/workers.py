@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any
 
@@ -35,10 +35,26 @@ def cluster(address: str) -> Callable[[], Executor]:
         except (OSError, ValueError) as error:
             msg = f"--scheduler {address}: no dask scheduler answers there: {' '.join(str(error).split())}"
             raise UsageError(msg) from error
-        executor: Any = client.get_executor(pure=False)
-        return executor  # type: ignore[no-any-return]
+        return _Cluster(client)
 
     return connected
+
+
+class _Cluster(Executor):
+    """Dask's own executor, which closes its client with it and leaves the cluster alone."""
+
+    def __init__(self, client: Any) -> None:
+        self._client, self._executor = client, client.get_executor(pure=False)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """On any worker; done again on another where that one dies."""
+        future: Future[Any] = self._executor.submit(fn, *args, **kwargs)
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Tasks that were not done are cancelled: nobody is left to take their outcome."""
+        self._executor.shutdown(wait=wait and not cancel_futures)
+        self._client.close()
 
 
 def _end_quietly() -> None:

@@ -1,0 +1,197 @@
+"""What may happen in the middle of a long run, done for real: processes killed, disks full, Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scanfind.cli import main
+from scanfind.errors import OutputError, UsageError
+from scanfind.pose import Pose
+from scanfind.scans import open_stations
+from scanfind.tiles.workers import processes
+from test_find import QUICK
+from test_tiles import assert_same, corridor, in_tiles, library, narrow, serial
+
+__all__ = ["narrow"]
+DEADLINE_S = 120.0
+
+
+class Enough(Exception):  # noqa: N818
+    """An end of a run that nobody foresaw."""
+
+
+def until(holds: Callable[[], bool]) -> None:
+    ends = time.monotonic() + DEADLINE_S
+    while not holds():
+        assert time.monotonic() < ends
+        time.sleep(0.02)
+
+
+@pytest.mark.slow
+def test_a_killed_worker_changes_nothing(tmp_path: Path, narrow: int) -> None:
+    pools: list[Any] = []
+
+    def pool() -> Executor:
+        pools.append(processes(2)())
+        return pools[-1]  # type: ignore[no-any-return]
+
+    def kill_one() -> None:
+        until(lambda: any((tmp_path / "work").glob("search-*")))
+        os.kill(next(iter(pools[0]._processes)), signal.SIGKILL)
+
+    killer = threading.Thread(target=kill_one)
+    killer.start()
+    found = in_tiles(narrow, pool, work=tmp_path / "work")
+    killer.join()
+    assert len(pools) == 2
+    assert_same(found, serial())
+
+
+def test_workers_that_die_of_everything_are_told(tmp_path: Path, narrow: int) -> None:
+    class Dying(Executor):
+        def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Any:
+            from concurrent.futures.process import BrokenProcessPool
+
+            raise BrokenProcessPool
+
+    with pytest.raises(OutputError, match=r"workers died, last of all during scan-00000: .* --resume"):
+        in_tiles(narrow, Dying, work=tmp_path / "work")
+
+
+def test_what_is_done_is_not_done_again(tmp_path: Path, narrow: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    work, done = tmp_path / "work", []
+
+    def stop_at_second(stage: str, so_far: float, total: float) -> None:
+        if stage == "search" and so_far == 2:
+            raise Enough
+
+    with pytest.raises(Enough):
+        in_tiles(narrow, work=work, progress=stop_at_second)
+    with pytest.raises(UsageError, match="--resume"):
+        in_tiles(narrow, work=work)
+    with pytest.raises(UsageError, match="other seed"):
+        in_tiles(narrow, work=work, resume=True, seed=7)
+    before = {path: path.stat().st_mtime_ns for path in work.glob("*/done")}
+    assert len([path for path in before if path.parent.name.startswith("search-")]) == 2
+    found = in_tiles(narrow, work=work, resume=True, progress=lambda *told: done.append(told))
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert_same(found, serial())
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    if subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=12m", "tmpfs", folder], check=False, capture_output=True
+    ).returncode:
+        pytest.skip("needs the right to mount a tmpfs")
+    yield folder
+    subprocess.run(["umount", "-l", folder], check=True)
+
+
+def test_a_full_disk_is_one_line_and_no_end(small_disk: Path, narrow: int) -> None:
+    work = small_disk / "work"
+    with pytest.raises(OutputError, match=r"work: .*: make room, then give --resume") as raised:
+        in_tiles(narrow, work=work)
+    assert "\n" not in str(raised.value)
+    subprocess.run(["mount", "-o", "remount,size=900m", small_disk], check=True)
+    assert_same(in_tiles(narrow, work=work, resume=True), serial())
+
+
+@pytest.fixture(scope="module")
+def setups(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The corridor as a folder of E57 files, one a station, and the models as a library."""
+    from scanfind.library import ModelLibrary
+
+    folder = tmp_path_factory.mktemp("site")
+    (folder / "setups").mkdir()
+    for k, cloud in enumerate(corridor()):
+        assert cloud.origin is not None
+        with open_stations(folder / "setups" / f"setup{k}.e57", {}) as writer:
+            writer.station(f"setup{k}", Pose(np.eye(3), cloud.origin), (1, 1))
+            writer.write(cloud.xyz, {})
+    with ModelLibrary.open(folder / "parts.scanfind", create=True) as kept:
+        for model in library().models():
+            kept.put(model)
+    (folder / "quick.toml").write_text(
+        f"[grid]\ncell_m = {QUICK.grid.cell_m}\n[search]\ntime_limit_s = 'none'\n"
+        f"pairs_a_round = {QUICK.search.pairs_a_round}\nhypotheses_a_round = {QUICK.search.hypotheses_a_round}\n"
+        f"kept = {QUICK.search.kept}\n"
+    )
+    return folder
+
+
+def command(setups: Path, out: Path, *more: str, memory: str = "1200MB") -> list[str]:
+    return ["find", str(setups / "setups"), "--library", str(setups / "parts.scanfind"), "--config",
+            str(setups / "quick.toml"), "--memory", memory, "--out", str(out), *more]  # fmt: skip
+
+
+def detections(out: Path) -> list[Any]:
+    found = json.loads((out / "results.json").read_text())["detections"]
+    assert len(found) == 3
+    return sorted(([one["model"], one["scene_from_model"], one["points"]] for one in found), key=str)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(setups: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
+    out = tmp_path_factory.mktemp("undisturbed") / "found"
+    assert main(command(setups, out)) == 0
+    assert not out.with_name("found.scanfind-work").exists()
+    return detections(out)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_an_interrupted_run_goes_on(setups: Path, undisturbed: list[Any], tmp_path: Path, how: signal.Signals) -> None:
+    out, work = tmp_path / "found", tmp_path / "found.scanfind-work"
+    with subprocess.Popen(
+        [sys.executable, "-m", "scanfind", *command(setups, out)], stderr=subprocess.PIPE, text=True
+    ) as run:
+        until((work / "scan-00002" / "done").exists)
+        run.send_signal(how)
+        said = run.communicate()[1]
+    assert run.returncode == (130 if how == signal.SIGINT else -signal.SIGKILL)
+    if how == signal.SIGINT:
+        assert f"interrupted: what is done lies in {work}: give --resume" in said
+        assert "Traceback" not in said
+    assert not out.exists()
+    assert main(command(setups, out, "--resume")) == 0
+    assert detections(out) == undisturbed
+    assert not work.exists()
+
+
+@pytest.mark.slow
+def test_an_unreadable_setup_among_others_is_told_by_the_exit_code(
+    setups: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(setups, tmp_path / "site")
+    damaged = tmp_path / "site" / "setups" / "setup9.e57"
+    damaged.write_bytes((setups / "setups" / "setup1.e57").read_bytes()[:100_000])
+    assert main(command(tmp_path / "site", tmp_path / "found", "--workers", "2", memory="2400MB")) == 4
+    assert "setup9.e57 was left out" in capsys.readouterr().err
+    assert len(detections(tmp_path / "found")) == 3
+
+
+@pytest.mark.slow
+def test_a_dask_cluster_does_the_same(tmp_path: Path, narrow: int) -> None:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as local:
+        from scanfind.tiles.workers import cluster
+
+        found = in_tiles(narrow, cluster(local.scheduler_address), work=tmp_path / "work")
+    assert_same(found, serial())
