@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import struct
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
@@ -14,15 +15,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scanfind.cloud import PointChunk, PointCloud
+import scanfind.sources
+from scanfind.cloud import CHUNK_POINTS, PointChunk, PointCloud
 from scanfind.detection import Findings
 from scanfind.errors import UnreadableFileError, UsageError
 from scanfind.find import find
 from scanfind.moments import ROW, MomentGrid
-from scanfind.scans import open_writer
+from scanfind.scans import open_writer, read_scan, scan_info
 from scanfind.tiles import find_in_tiles
 from scanfind.tiles import plan as planned
-from scanfind.tiles.plan import BASE_BYTES, ROW_BYTES, STATION_BYTES, Tile, size_of, tiles_of
+from scanfind.tiles.plan import BASE_BYTES, ROW_BYTES, STATION_BYTES, estimate, size_of, tiles_of
 from scanfind.tiles.workers import processes
 from test_find import BRACKET, QUICK, Floats, clouds, library
 
@@ -175,12 +177,47 @@ def test_every_bin_has_one_tile_and_no_tile_too_much(bins: list[tuple[int, int, 
     try:
         tiles = tiles_of(every, rows, margin, most)
     except UsageError:
-        assert any(rows[Tile(one, (one[0] + 1, one[1] + 1, one[2] + 1)).grown(margin).holds(every)].sum() > most
-                   for one in bins)  # fmt: skip
+        assert max(rows[(abs(every - one) <= margin).all(axis=1)].sum() for one in every) > most
         return
     np.testing.assert_array_equal(sum(tile.holds(every).astype(int) for tile in tiles), 1)
     assert all(rows[tile.grown(margin).holds(every)].sum() <= most for tile in tiles)
     assert tiles == tiles_of(every[::-1], rows[::-1], margin, most)
+
+
+FIRST_BEYOND = 2**32 + 7
+
+
+def test_points_beyond_the_32nd_bit_keep_their_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    read = scanfind.sources.chunks_of
+
+    def far_on(cloud: PointCloud) -> Iterator[PointChunk]:
+        return (replace(chunk, source_index=chunk.source_index + FIRST_BEYOND) for chunk in read(cloud))
+
+    monkeypatch.setattr("scanfind.sources.chunks_of", far_on)
+    (found,) = find_in_tiles(clouds(), library(), parameters=QUICK)
+    assert found.isolated is not None
+    cloud, where = clouds()[0], found.isolated.scan_id == 0
+    numbers = found.isolated.source_index[where] - FIRST_BEYOND
+    np.testing.assert_array_equal(cloud.xyz[numbers], found.isolated.xyz[where])
+
+
+def test_headers_beyond_the_32nd_bit_are_believed_only_where_the_file_is_as_long(tmp_path: Path) -> None:
+    path, points = tmp_path / "long.las", FIRST_BEYOND
+    with open_writer(path, {}) as writer:
+        writer.write(np.zeros((1, 3)), {})
+    header = bytearray(path.read_bytes())
+    start, record = struct.unpack_from("<I", header, 96)[0], struct.unpack_from("<H", header, 105)[0]
+    header[107:111] = bytes(4)  # the count of old, of 32 bits
+    header[247:255] = struct.pack("<Q", points)
+    path.write_bytes(header)
+    with pytest.raises(UnreadableFileError, match=f"promises {points:,} points"):
+        for _ in read_scan(path):
+            pass
+    with path.open("r+b") as file:
+        file.truncate(start + record * points)  # as long as it says, and sparse
+    assert scan_info(path).points == points
+    assert f"{points:,} points" in estimate([scan_info(path)], [(0.02, 2.0)], 0.02, 2.56).words()
+    assert len(next(read_scan(path))) == CHUNK_POINTS
 
 
 def summed_grid(points: Sequence[Floats], jobs: int) -> MomentGrid:

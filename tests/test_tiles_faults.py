@@ -23,8 +23,8 @@ from scanfind.errors import OutputError, UsageError
 from scanfind.pose import Pose
 from scanfind.scans import open_stations
 from scanfind.tiles.workers import processes
-from test_find import QUICK
-from test_tiles import assert_same, corridor, in_tiles, library, narrow, serial
+from test_find import QUICK, library
+from test_tiles import assert_same, corridor, in_tiles, narrow, serial
 
 __all__ = ["narrow"]
 DEADLINE_S = 120.0
