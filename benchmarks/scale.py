@@ -155,8 +155,9 @@ def read_e57(file: Path) -> None:
         for k in range(e57.scan_count):
             header = e57.get_header(k)
             buffers = libe57.VectorSourceDestBuffer()
-            for name in header.point_fields:
-                column = np.empty(CHUNK_POINTS, np.float64)
+            # Kept: the buffers do not hold on to the arrays they fill.
+            columns = [np.empty(CHUNK_POINTS, np.float64) for _ in header.point_fields]
+            for name, column in zip(header.point_fields, columns, strict=True):
                 buffers.append(libe57.SourceDestBuffer(e57.image_file, name, column, CHUNK_POINTS, True, True))
             reader = header.points.reader(buffers)
             while reader.read():
