@@ -42,7 +42,7 @@ def until(holds: Callable[[], bool]) -> None:
 
 
 @pytest.mark.slow
-def test_a_killed_worker_changes_nothing(tmp_path: Path, narrow: int) -> None:
+def test_two_processes_do_the_same_and_one_of_them_killed_changes_nothing(tmp_path: Path, narrow: int) -> None:
     pools: list[Any] = []
 
     def pool() -> Executor:
@@ -72,11 +72,11 @@ def test_workers_that_die_of_everything_are_told(tmp_path: Path, narrow: int) ->
         in_tiles(narrow, Dying, work=tmp_path / "work")
 
 
-def test_what_is_done_is_not_done_again(tmp_path: Path, narrow: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    work, done = tmp_path / "work", []
+def test_what_is_done_is_not_done_again(tmp_path: Path, narrow: int) -> None:
+    work = tmp_path / "work"
 
     def stop_at_second(stage: str, so_far: float, total: float) -> None:
-        if stage == "search" and so_far == 2:
+        if stage == "search" and so_far == 1:
             raise Enough
 
     with pytest.raises(Enough):
@@ -86,8 +86,8 @@ def test_what_is_done_is_not_done_again(tmp_path: Path, narrow: int, monkeypatch
     with pytest.raises(UsageError, match="other seed"):
         in_tiles(narrow, work=work, resume=True, seed=7)
     before = {path: path.stat().st_mtime_ns for path in work.glob("*/done")}
-    assert len([path for path in before if path.parent.name.startswith("search-")]) == 2
-    found = in_tiles(narrow, work=work, resume=True, progress=lambda *told: done.append(told))
+    assert len([path for path in before if path.parent.name.startswith("search-")]) == 1
+    found = in_tiles(narrow, work=work, resume=True)
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert_same(found, serial())
 
@@ -136,9 +136,9 @@ def setups(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def command(setups: Path, out: Path, *more: str, memory: str = "1200MB") -> list[str]:
+def command(setups: Path, out: Path, *more: str) -> list[str]:
     return ["find", str(setups / "setups"), "--library", str(setups / "parts.scanfind"), "--config",
-            str(setups / "quick.toml"), "--memory", memory, "--out", str(out), *more]  # fmt: skip
+            str(setups / "quick.toml"), "--memory", "1200MB", "--out", str(out), *more]  # fmt: skip
 
 
 def detections(out: Path) -> list[Any]:
@@ -182,7 +182,7 @@ def test_an_unreadable_setup_among_others_is_told_by_the_exit_code(
     shutil.copytree(setups, tmp_path / "site")
     damaged = tmp_path / "site" / "setups" / "setup9.e57"
     damaged.write_bytes((setups / "setups" / "setup1.e57").read_bytes()[:100_000])
-    assert main(command(tmp_path / "site", tmp_path / "found", "--workers", "2", memory="2400MB")) == 4
+    assert main(command(tmp_path / "site", tmp_path / "found")) == 4
     assert "setup9.e57 was left out" in capsys.readouterr().err
     assert len(detections(tmp_path / "found")) == 3
 

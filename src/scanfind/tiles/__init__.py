@@ -24,7 +24,7 @@ from tempfile import mkdtemp
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic_core import to_jsonable_python
 
 from scanfind.clock import Clock, say_if_compiling
@@ -42,15 +42,15 @@ from scanfind.sources import Scan
 from scanfind.threads import available_cores
 from scanfind.tiles.listed import Listed, listed_of
 from scanfind.tiles.plan import (
+    Held,
     Tile,
     bin_blocks,
     estimate,
     margin_bins,
-    most_rows,
     tiles_of,
     words,
 )
-from scanfind.tiles.stored import parts_of, rows_by_bin
+from scanfind.tiles.stored import parts_of, reached_from, rows_by_bin
 from scanfind.tiles.tasks import (
     Cut,
     Found,
@@ -74,8 +74,6 @@ if TYPE_CHECKING:
     from scanfind.progress import Progress
 
 __all__ = ["find_in_tiles"]
-
-Ints = NDArray[np.int64]
 
 MEMORY = 2_000_000_000  # a worker, where nobody says
 REFUSED_SHOWN = 3  # of each model
@@ -158,12 +156,13 @@ def _find(
     with clock("grid"):
         summed = sum_all_up(job, listed, crew, tell, say)
         folders = [folder / scan_name(k) for k, one in enumerate(summed) if not one.missing]
-        bins, rows = rows_by_bin(parts_of(folders))
+        parts = parts_of(folders)
+        held = Held(*rows_by_bin(parts), reached_from(parts) / job.bin_m())
 
     findings, searched, largest = Findings(), list[Searched](), None
     for group, size in enumerate(sizes.groups()):
         with clock("search"):
-            found = search_all(job, group, size.models, bins, rows, summed, folders, findings, searched, crew, tell)
+            found = search_all(job, group, size.models, held, summed, folders, findings, searched, crew, tell)
             findings.extend(own(found, job))
             searched += found.values()
             largest = largest or next((one for one in typical(found) if one.detections), None)
@@ -272,14 +271,13 @@ def stored_words(job: Job, listed: Listed) -> str:
 
 
 def search_all(
-    job: Job, group: int, models: list[Model], bins: Ints, rows: Ints, summed: list[Summed],
+    job: Job, group: int, models: list[Model], held: Held, summed: list[Summed],
     folders: list[Path], standing: Sequence[Detection], searched: list[Searched], crew: Crew, tell: Progress,
 ) -> dict[Tile, Searched]:  # fmt: skip
     """What every tile of the site holds of the models of one size."""
     _, levels = cell_of(job, models)
-    margin, stations = margin_bins(models, job.bin_m()), sum(len(one.told.stations) for one in summed)
     # A cell of a level above stands for four of a surface.
-    tiles = tiles_of(bins, rows // 4**levels, margin, most_rows(job.memory, stations))
+    tiles = tiles_of(held._replace(rows=held.rows // 4**levels), margin_bins(models, job.bin_m()), job.memory)
     taken = [Found(k, one.model, one.scene_from_model) for k, one in enumerate(standing)]
     reach = 2.0 * max((one.reach for one in searched), default=0.0)
     signed = all(one.signed for one in summed)

@@ -77,17 +77,30 @@ def margin_bins(models: Sequence[Model], bin_m: float) -> int:
     return ceil(max(model.diameter for model in models) / bin_m)
 
 
-def most_rows(memory: int, stations: int) -> int:
-    """How many rows a tile may have, of the finest cells of its search."""
-    return int((memory - BASE_BYTES - stations * STATION_BYTES) // ROW_BYTES)
+class Held(NamedTuple):
+    """What lies where in a site, by bins from the grid's offset.
 
-
-def tiles_of(bins: Ints, rows: Ints, margin: int, most: int) -> list[Tile]:
-    """Cut a site until every tile, with its margin, has no more rows than it may; in the order of their places.
-
-    bins : (K, 3) the bins with anything in them; rows : (K,) how much
-    Raises UsageError where a single bin with its margin has more.
+    bins : (K, 3) with anything in them; rows : (K,) how many rows of the finest cells of a search each holds
+    reached : (S, 2, 3) low and high corner of what the beams of each scanner position went through, in bins
     """
+
+    bins: Ints
+    rows: Ints
+    reached: Floats
+
+    def needed(self, tile: Tile) -> int:
+        """Bytes it takes to search a tile that has its margin."""
+        inside = (self.reached[:, 0] <= tile.high).all(axis=1) & (self.reached[:, 1] >= tile.low).all(axis=1)
+        rows = int(self.rows[tile.holds(self.bins)].sum())
+        return BASE_BYTES + STATION_BYTES * int(inside.sum()) + ROW_BYTES * rows
+
+
+def tiles_of(held: Held, margin: int, memory: int) -> list[Tile]:
+    """Cut a site until every tile, with a margin of so many bins, fits the memory; in the order of their places.
+
+    Raises UsageError where a single bin with its margin does not.
+    """
+    bins = held.bins
     todo = [Tile((*bins.min(axis=0).tolist(),), (*(bins.max(axis=0) + 1).tolist(),))] if len(bins) else []
     tiles = []
     while todo:
@@ -97,14 +110,14 @@ def tiles_of(bins: Ints, rows: Ints, margin: int, most: int) -> list[Tile]:
             continue
         # To what it holds: halves of an L-shaped site would else keep the empty corner.
         tile = Tile((*bins[mine].min(axis=0).tolist(),), (*(bins[mine].max(axis=0) + 1).tolist(),))
-        needed = int(rows[tile.grown(margin).holds(bins)].sum())
-        if needed <= most:
+        needed = held.needed(tile.grown(margin))
+        if needed <= memory:
             tiles.append(tile)
             continue
         sizes = np.subtract(tile.high, tile.low)
         if sizes.max() == 1:
             msg = (
-                f"--memory is too small: the smallest tile needs {words(needed * ROW_BYTES + BASE_BYTES)}: give more, "
+                f"--memory is too small: the smallest tile needs {words(needed)}: give more, "
                 "or larger cells (grid.cell_m)"
             )
             raise UsageError(msg)

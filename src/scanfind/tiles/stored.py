@@ -100,6 +100,12 @@ def rows_by_bin(parts: Sequence[Path]) -> tuple[Ints, Ints]:
     return bins, rows
 
 
+def reached_from(parts: Sequence[Path]) -> Floats:
+    """Low and high corner, (S, 2, 3), of what the beams of each scanner position went through, from the offset."""
+    boxes = [np.load(part / BOXES) for part in parts if (part / BOXES).is_file()]
+    return np.concatenate([np.empty((0, 2, 3)), *boxes])
+
+
 def rows_in(parts: Sequence[Path], box: Tile) -> Iterator[NDArray[Any]]:
     """The rows (R,) of ROW of the bins in a box, some at a time."""
     for part in parts:
