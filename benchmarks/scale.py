@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -30,7 +31,7 @@ from scanfind.simulate.scanner import scan
 from scanfind.simulate.scenes import shop
 from scanfind.tiles import find_in_tiles
 from scanfind.tiles.plan import size_of
-from scanfind.tiles.workers import processes
+from scanfind.tiles.workers import cluster, processes
 
 # Different shops, of which a site has copies side by side in rows of six; each is one file of three setups.
 SEEDS = (1000, 1001)
@@ -47,6 +48,7 @@ class Row:
     shops: int
     points: int
     workers: int
+    dask: int
     memory_mb: float
     peak_memory_mb: float
     tiles: int
@@ -64,7 +66,7 @@ class Row:
 
 def main(
     shops: str = "1,4", points: float = 10e6, kind: str = "e57", workers: str = "0", memory: str = "3GB",
-    folder: Path | None = None, date: str = "", *, library: bool = True,
+    folder: Path | None = None, date: str = "", *, library: bool = True, dask: bool = False,
 ) -> None:  # fmt: skip
     """Make a site, search parts of it of several sizes in tiles, each in a process of its own.
 
@@ -75,6 +77,7 @@ def main(
     :param memory: of all workers together.
     :param folder: where the site lies or is made; a temporary one unless given.
     :param date: written to the CSV.
+    :param dask: workers are those of a local dask cluster.
     :param library: also read each size twice with the file library alone.
     """
     rows = []
@@ -86,7 +89,7 @@ def main(
             files = [file_of(where, k, kind) for k in range(count)]
             alone_s = 2.0 * timed_read(files) if library else float("nan")
             for crew in workers.split(","):
-                rows.append(row := measured(files, kind, int(crew), memory, truth[:count], alone_s))
+                rows.append(row := measured(files, kind, int(crew), memory, truth[:count], alone_s, dask))
                 print(row, flush=True)
     lines = summary(rows)
     tell(lines, write_csv(f"scale_{kind}", rows, ",".join(map(str, SEEDS)), date, lines))
@@ -165,29 +168,36 @@ def read_e57(file: Path) -> None:
             reader.close()
 
 
-def measured(files: list[Path], kind: str, workers: int, memory: str, truth: Floats, alone_s: float) -> Row:
+def measured(files: list[Path], kind: str, workers: int, memory: str, truth: Floats, alone_s: float, dask: bool) -> Row:
     """Search in a process of its own, whose memory is nobody else's."""
-    call = [sys.executable, "-m", "benchmarks.scale", "child", str(workers), memory, *map(str, files)]
+    call = [sys.executable, "-m", "benchmarks.scale", "child", str(workers), memory, str(int(dask)), *map(str, files)]
     told = json.loads(subprocess.run(call, capture_output=True, text=True, check=True).stdout.splitlines()[-1])
     places = np.array(told.pop("places")).reshape(-1, 3)
     apart = np.linalg.norm(places[:, None] - truth[None], axis=2)
     right = int((apart.min(axis=0, initial=np.inf) < FOUND_M).sum())
     return Row(
-        kind=kind, shops=len(files), workers=workers, memory_mb=size_of(memory) / 1e6, library_twice_s=alone_s,
+        kind=kind, shops=len(files), workers=workers, dask=int(dask), memory_mb=size_of(memory) / 1e6, library_twice_s=alone_s,
         ratio=told["find_s"] / alone_s, ns_a_point=1e9 * told["find_s"] / told["points"],
         found=right, false=len(places) - right, **told,
     )  # fmt: skip
 
 
-def child(workers: int, memory: str, files: list[Path]) -> None:
+def child(workers: int, memory: str, files: list[Path], *, dask: bool) -> None:
     """Search and print what it took as JSON."""
     mesh = pipe_spool()
     middle = 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
     began: dict[str, float] = {}
-    with TemporaryDirectory(dir=files[0].parent) as work:
+    with ExitStack() as stack:
+        work = stack.enter_context(TemporaryDirectory(dir=files[0].parent))
+        executor = processes(workers) if workers else None
+        if dask:
+            from distributed import LocalCluster
+
+            local = stack.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0"))
+            executor = cluster(local.scheduler_address)
         start = time.perf_counter()
         found = find_in_tiles(
-            files, mesh, executor=processes(workers) if workers else None,
+            files, mesh, executor=executor,
             memory=size_of(memory) // max(workers, 1), work=work, jobs=1 if workers else None,
             progress=lambda stage, done, total: began.__setitem__(stage, time.perf_counter() - start),
             say=lambda line: print(line, file=sys.stderr, flush=True),
@@ -222,6 +232,6 @@ def summary(rows: list[Row]) -> list[str]:
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["child"]:
-        child(int(sys.argv[2]), sys.argv[3], [Path(file) for file in sys.argv[4:]])
+        child(int(sys.argv[2]), sys.argv[3], [Path(file) for file in sys.argv[5:]], dask=sys.argv[4] == "1")
     else:
         cyclopts.run(main)

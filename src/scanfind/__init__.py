@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from scanfind.results import read_results, write_results
     from scanfind.scans import read_scan, scan_info
     from scanfind.symmetry import Symmetry, pose_error
+    from scanfind.tiles import find_in_tiles
 
     __version__: str
 
@@ -46,6 +47,7 @@ __all__ = [
     "Symmetry",
     "__version__",
     "find",
+    "find_in_tiles",
     "isolate",
     "pose_error",
     "read_models",
@@ -64,6 +66,7 @@ _HOME = {
     "PRESETS": "parameters",
     "Parameters": "parameters",
     "find": "find",
+    "find_in_tiles": "tiles",
     "isolate": "isolate",
     "ModelLibrary": "library",
     "Mesh": "mesh",

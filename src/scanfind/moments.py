@@ -41,7 +41,8 @@ class MomentGrid:
 
     cell : edge of a cell, metres; offset : (3,) float64, the grid's origin in the points' frame (`None`: the median of
     the first points, rounded to whole metres, so that coordinates keep their digits however far from zero the scan is).
-    jobs : threads
+    jobs : threads; expected_rows : where more are known to come, arrays need not be doubled, for a moment holding twice
+    as much
 
     points : added so far
     signed : every chunk said where its scanner stood
@@ -52,7 +53,9 @@ class MomentGrid:
     counts : (shards, 3) blocks and rows in use, and points left out; see kernels.grid.place_of for where they lie
     """
 
-    def __init__(self, cell: float, offset: Floats | None = None, jobs: int = 1) -> None:
+    def __init__(
+        self, cell: float, offset: Floats | None = None, jobs: int = 1, expected_rows: int = EMPTY_ROWS
+    ) -> None:
         from scanfind.kernels.grid import MOMENTS, OFFSET_UNITS
 
         self.cell = cell
@@ -62,8 +65,9 @@ class MomentGrid:
         self.units = OFFSET_UNITS
         self.block_keys = np.full(EMPTY_BLOCKS, -1, np.int64)
         self.block_rows = room((EMPTY_BLOCKS, 512), np.dtype(np.int32))
-        self.moments = room((EMPTY_ROWS, MOMENTS), np.dtype(np.int64))
-        self.links = room((EMPTY_ROWS, 2), np.dtype(np.int32))
+        rows = max(EMPTY_ROWS, expected_rows)
+        self.moments = room((rows, MOMENTS), np.dtype(np.int64))
+        self.links = room((rows, 2), np.dtype(np.int32))
         self._jobs, self._shards = jobs, min(jobs, MOST_SHARDS)
         self.counts = np.zeros((self._shards, 3), np.int64)
         self._tables = [empty_hash(EMPTY_BLOCKS // self._shards) for _ in range(self._shards)]

@@ -28,7 +28,7 @@ LEAST_BIN_M = 2.0  # smaller bins are cut no better, and a site has a million of
 # What a process takes before it has read a point: Python, its libraries, compiled kernels, one chunk of points.
 BASE_BYTES = 450_000_000
 # Of a tile's memory, all levels and everything the search derives from them, for each row of its finest cells.
-ROW_BYTES = 400
+ROW_BYTES = 280
 # The nearest beams of one scanner position, and the depth map made of them.
 STATION_BYTES = 6 * 360**2 * (8 + 4 + 4)
 # Rows on a square metre of a tile's floor, times the square of a cell: surfaces over and on it, views of each.

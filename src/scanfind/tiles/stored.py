@@ -117,6 +117,12 @@ def rows_in(parts: Sequence[Path], box: Tile) -> Iterator[NDArray[Any]]:
                 yield np.fromfile(file, ROW, count)
 
 
+def count_in(parts: Sequence[Path], box: Tile) -> int:
+    """How many rows are stored for the bins in a box: there may be fewer when they are summed."""
+    pieces = [np.load(part / PIECES) for part in parts]
+    return sum(int(some["count"][box.holds(some["bin"])].sum()) for some in pieces)
+
+
 def beams_into(parts: Sequence[Path], box: Floats) -> list[Beams]:
     """What scanners saw whose beams may have come into a box: low and high corner (2, 3), from the grid's offset.
 

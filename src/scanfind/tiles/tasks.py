@@ -27,7 +27,7 @@ from scanfind.scene import first_cell
 from scanfind.sizes import Size, Sizes, by_size
 from scanfind.sources import Scan, source_of
 from scanfind.tiles.plan import BASE_BYTES, Tile, bin_metres, margin_bins
-from scanfind.tiles.stored import Store, beams_into, parts_of, rows_in
+from scanfind.tiles.stored import Store, beams_into, count_in, parts_of, rows_in
 
 if TYPE_CHECKING:
     from scanfind.kernels.distance import NearSurface
@@ -189,7 +189,8 @@ def grid_of(job: Job, models: Sequence[Model], tile: Tile, signed: bool, scans: 
     box = tile.grown(margin_bins(models, job.bin_m()))
     parts = parts_of(scans)
     cell, levels = cell_of(job, models)
-    grid = MomentGrid(cell, np.array(job.offset), job.jobs)
+    # Shards are not quite of one size.
+    grid = MomentGrid(cell, np.array(job.offset), job.jobs, int(1.25 * count_in(parts, box)) + 100_000)
     grid.units *= 2.0**levels
     for rows in rows_in(parts, box):
         for coarse in coarsened(job, rows, levels):
