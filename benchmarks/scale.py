@@ -176,8 +176,8 @@ def measured(files: list[Path], kind: str, workers: int, memory: str, truth: Flo
     apart = np.linalg.norm(places[:, None] - truth[None], axis=2)
     right = int((apart.min(axis=0, initial=np.inf) < FOUND_M).sum())
     return Row(
-        kind=kind, shops=len(files), workers=workers, dask=int(dask), memory_mb=size_of(memory) / 1e6, library_twice_s=alone_s,
-        ratio=told["find_s"] / alone_s, ns_a_point=1e9 * told["find_s"] / told["points"],
+        kind=kind, shops=len(files), workers=workers, dask=int(dask), memory_mb=size_of(memory) / 1e6,
+        library_twice_s=alone_s, ratio=told["find_s"] / alone_s, ns_a_point=1e9 * told["find_s"] / told["points"],
         found=right, false=len(places) - right, **told,
     )  # fmt: skip
 

@@ -22,6 +22,7 @@ from scanfind.errors import UnreadableFileError, UsageError
 from scanfind.find import find
 from scanfind.moments import ROW, MomentGrid
 from scanfind.scans import open_writer, read_scan, scan_info
+from scanfind.sources import scans_of
 from scanfind.tiles import find_in_tiles
 from scanfind.tiles import plan as planned
 from scanfind.tiles.plan import BASE_BYTES, ROW_BYTES, STATION_BYTES, Held, estimate, size_of, tiles_of
@@ -153,6 +154,17 @@ def test_of_many_scans_one_that_cannot_be_read_is_left_out(tmp_path: Path) -> No
     assert [scan.points for scan in found.scans] == [len(clouds()[0]), 0, len(clouds()[0])]
     alone = find_in_tiles([files[0], files[2]], library(), parameters=QUICK, origin=origin)
     np.testing.assert_array_equal(alone[0].scene_from_model.matrix(), found[0].scene_from_model.matrix())
+
+
+def test_a_folder_or_a_pattern_stands_for_its_scans(tmp_path: Path) -> None:
+    for name in ("b.ply", "a.E57", "notes.txt", "c.laz"):
+        (tmp_path / name).touch()
+    assert [Path(str(one)).name for one in scans_of(tmp_path)] == ["a.E57", "b.ply", "c.laz"]
+    assert [Path(str(one)).name for one in scans_of([tmp_path / "*.ply", "d.e57"])] == ["b.ply", "d.e57"]
+    for nothing in (tmp_path / "*.las", tmp_path / "empty"):
+        (tmp_path / "empty").mkdir(exist_ok=True)
+        with pytest.raises(UsageError, match="no "):
+            scans_of(nothing)
 
 
 def test_where_no_scan_can_be_read_the_first_error_is_told(tmp_path: Path) -> None:

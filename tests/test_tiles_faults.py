@@ -22,7 +22,7 @@ from scanfind.cli import main
 from scanfind.errors import OutputError, UsageError
 from scanfind.pose import Pose
 from scanfind.scans import open_stations
-from scanfind.tiles.workers import processes
+from scanfind.tiles.workers import cluster, processes
 from test_find import QUICK, library
 from test_tiles import assert_same, corridor, in_tiles, narrow, serial
 
@@ -41,6 +41,11 @@ def until(holds: Callable[[], bool]) -> None:
         time.sleep(0.02)
 
 
+def kill_once_searching(work: Path, victim: Callable[[], int]) -> None:
+    until(lambda: any(work.glob("search-*")))
+    os.kill(victim(), signal.SIGKILL)
+
+
 @pytest.mark.slow
 def test_two_processes_do_the_same_and_one_of_them_killed_changes_nothing(tmp_path: Path, narrow: int) -> None:
     pools: list[Any] = []
@@ -49,11 +54,8 @@ def test_two_processes_do_the_same_and_one_of_them_killed_changes_nothing(tmp_pa
         pools.append(processes(2)())
         return pools[-1]  # type: ignore[no-any-return]
 
-    def kill_one() -> None:
-        until(lambda: any((tmp_path / "work").glob("search-*")))
-        os.kill(next(iter(pools[0]._processes)), signal.SIGKILL)
-
-    killer = threading.Thread(target=kill_one)
+    first = lambda: next(iter(pools[0]._processes))  # noqa: E731
+    killer = threading.Thread(target=kill_once_searching, args=(tmp_path / "work", first))
     killer.start()
     found = in_tiles(narrow, pool, work=tmp_path / "work")
     killer.join()
@@ -188,10 +190,12 @@ def test_an_unreadable_setup_among_others_is_told_by_the_exit_code(
 
 
 @pytest.mark.slow
-def test_a_dask_cluster_does_the_same(tmp_path: Path, narrow: int) -> None:
+def test_a_dask_cluster_does_the_same_and_a_killed_worker_changes_nothing(tmp_path: Path, narrow: int) -> None:
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as local:
-        from scanfind.tiles.workers import cluster
-
+        victim = next(iter(local.workers.values())).pid
+        killer = threading.Thread(target=kill_once_searching, args=(tmp_path / "work", lambda: victim))
+        killer.start()
         found = in_tiles(narrow, cluster(local.scheduler_address), work=tmp_path / "work")
+        killer.join()
     assert_same(found, serial())

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from scanfind.cli.options import note
-from scanfind.errors import UsageError
+from scanfind.errors import Interrupted, UsageError
 
 if TYPE_CHECKING:
     from scanfind.config import Run
@@ -62,6 +62,8 @@ class Tiled(NamedTuple):
         self, scans: Sequence[Path], models: ModelLibrary, run: Run, parameters: Parameters, progress: Progress
     ) -> Findings:
         """Search."""
+        from multiprocessing import active_children
+
         from scanfind.threads import available_cores
         from scanfind.tiles import find_in_tiles
         from scanfind.tiles.workers import cluster, processes
@@ -71,11 +73,17 @@ class Tiled(NamedTuple):
             executor = cluster(self.scheduler)
         elif self.workers is not None:
             executor = processes(self.workers)
-        return find_in_tiles(
-            scans, models, executor=executor, memory=self.memory, work=self.work, resume=self.resume,
-            parameters=parameters, seed=run.seed, jobs=run.jobs or max(1, available_cores() // (self.workers or 1)),
-            origin=run.origin, progress=progress, say=note,
-        )  # fmt: skip
+        try:
+            return find_in_tiles(
+                scans, models, executor=executor, memory=self.memory, work=self.work, resume=self.resume,
+                parameters=parameters, seed=run.seed, jobs=run.jobs or max(1, available_cores() // (self.workers or 1)),
+                origin=run.origin, progress=progress, say=note,
+            )  # fmt: skip
+        except (Interrupted, KeyboardInterrupt):
+            # Else Python waits for what workers are at, a minute or more.
+            for worker in active_children():
+                worker.terminate()
+            raise
 
     def finished(self) -> None:
         """The result is written: what was kept on the way goes."""

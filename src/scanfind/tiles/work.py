@@ -110,7 +110,8 @@ class Crew:
 
     def __exit__(self, *raised: object) -> None:
         if self._pool is not None and self._pool is not self._workers:
-            self._pool.shutdown(wait=True, cancel_futures=True)
+            # Whoever pressed Ctrl-C does not wait for what is being done.
+            self._pool.shutdown(wait=not raised or raised[0] is None, cancel_futures=True)
             self._pool = None
 
 
