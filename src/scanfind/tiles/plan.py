@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 BLOCK_CELLS = 8  # along the edge of a block
-LEAST_BIN_M = 2.0  # smaller bins are cut no better, and a site has a million of them
+LEAST_BIN_M = 1.0  # smaller bins are cut no better, and a site has a million of them
 
 # What a process takes before it has read a point: Python, its libraries, compiled kernels, one chunk of points.
 BASE_BYTES = 450_000_000
@@ -63,8 +63,11 @@ class Tile(NamedTuple):
 
 
 def bin_blocks(cell: float, diameter: float) -> int:
-    """log2 of the blocks along the edge of a bin: half the smallest model, but no less than LEAST_BIN_M."""
-    return max(0, ceil(log2(max(0.5 * diameter, LEAST_BIN_M) / (BLOCK_CELLS * cell)) - 1e-9))
+    """log2 of the blocks along the edge of a bin: a quarter of the smallest model, but no less than LEAST_BIN_M.
+
+    Margins are whole bins: with bins of half a model, tiles of 15 m had 4.7 m of it on each side instead of 3.5.
+    """
+    return max(0, ceil(log2(max(0.25 * diameter, LEAST_BIN_M) / (BLOCK_CELLS * cell)) - 1e-9))
 
 
 def bin_metres(cell: float, blocks: int) -> float:
