@@ -50,7 +50,7 @@ from scanfind.tiles.plan import (
     tiles_of,
     words,
 )
-from scanfind.tiles.stored import parts_of, reached_from, rows_by_bin
+from scanfind.tiles.stored import parts_of, reached_from, stored_bins
 from scanfind.tiles.tasks import (
     Cut,
     Found,
@@ -58,6 +58,7 @@ from scanfind.tiles.tasks import (
     Searched,
     Summed,
     cell_of,
+    count,
     cut,
     gathered,
     on_disk,
@@ -76,6 +77,7 @@ if TYPE_CHECKING:
 __all__ = ["find_in_tiles"]
 
 MEMORY = 2_000_000_000  # a worker, where nobody says
+ROWS_AT_ONCE = 10_000_000  # counted by one worker, 80 MB and as much to sort them
 REFUSED_SHOWN = 3  # of each model
 
 
@@ -157,7 +159,7 @@ def _find(
         summed = sum_all_up(job, listed, crew, tell, say)
         folders = [folder / scan_name(k) for k, one in enumerate(summed) if not one.missing]
         parts = parts_of(folders)
-        held = Held(*rows_by_bin(parts), reached_from(parts) / job.bin_m())
+        held = held_by(job, parts, crew)
 
     findings, searched, largest = Findings(), list[Searched](), None
     for group, size in enumerate(sizes.groups()):
@@ -268,6 +270,17 @@ def stored_words(job: Job, listed: Listed) -> str:
     return words(
         sum(file.stat().st_size for k in range(len(listed.all)) for file in (job.folder / scan_name(k)).rglob("*"))
     )
+
+
+def held_by(job: Job, parts: list[Path], crew: Crew) -> Held:
+    """What lies where in the site, once all scans are summed."""
+    bins, rows, by_several = stored_bins(parts)
+    doubtful = np.flatnonzero(by_several)
+    lots = np.cumsum(rows[doubtful]) // ROWS_AT_ONCE
+    some = [doubtful[lots == k] for k in np.unique(lots)]
+    counted = all_done(job.folder, crew, {f"count-{k:05d}": (count, parts, bins[of]) for k, of in enumerate(some)})
+    rows[doubtful] = np.concatenate([np.empty(0, np.int64), *counted])
+    return Held(bins, rows, reached_from(parts) / job.bin_m())
 
 
 def search_all(

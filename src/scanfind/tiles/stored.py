@@ -83,21 +83,40 @@ def parts_of(folders: Iterable[Path]) -> list[Path]:
     return [part for folder in folders for part in sorted(folder.iterdir()) if (part / PIECES).is_file()]
 
 
-def rows_by_bin(parts: Sequence[Path]) -> tuple[Ints, Ints]:
-    """The bins (K, 3) with anything in them, and how many rows each has when all parts are summed, (K,)."""
+def stored_bins(parts: Sequence[Path]) -> tuple[Ints, Ints, NDArray[np.bool_]]:
+    """The bins (K, 3) with anything in them, how many rows are stored for each, (K,), and whether by several parts.
+
+    These may have seen the same cells: fifty setups in one hall would count its floor fifty times. See `summed_rows`.
+    """
     pieces = [np.load(part / PIECES) for part in parts]
     every = np.concatenate([np.empty(0, PIECE), *pieces])
     seen_by = np.repeat(np.arange(len(parts)), [len(some) for some in pieces])
     bins, which = np.unique(every["bin"], axis=0, return_inverse=True)
     which = which.reshape(-1)
     rows = np.bincount(which, every["count"], len(bins)).astype(np.int64)
-    by_two = np.bincount(np.unique(np.stack([which, seen_by]), axis=1)[0], minlength=len(bins)) > 1
-    for k in np.flatnonzero(by_two):  # fifty setups in one hall would count its floor fifty times
-        low = bins[k].tolist()
-        box = Tile((*low,), (*(x + 1 for x in low),))
-        cells = [some["key"] * SPREAD + some["place"] * 64 + some["view"] for some in rows_in(parts, box)]
-        rows[k] = len(np.unique(np.concatenate(cells)))
-    return bins, rows
+    by_several = np.bincount(np.unique(np.stack([which, seen_by]), axis=1)[0], minlength=len(bins)) > 1
+    return bins, rows, by_several
+
+
+def summed_rows(parts: Sequence[Path], bins: Ints) -> Ints:
+    """How many rows some bins (K, 3) have when all parts are summed, (K,)."""
+    numbers, order = packed(bins), np.argsort(packed(bins))
+    found: list[list[NDArray[np.int64]]] = [[np.empty(0, np.int64)] for _ in bins]
+    for part in parts:
+        pieces = np.load(part / PIECES)
+        pieces = pieces[np.isin(packed(pieces["bin"]), numbers)]
+        at = order[np.searchsorted(numbers[order], packed(pieces["bin"]))]
+        with (part / ROWS).open("rb") as file:
+            for k, start, count in zip(at.tolist(), pieces["start"].tolist(), pieces["count"].tolist(), strict=True):
+                file.seek(start * ROW.itemsize)
+                some = np.fromfile(file, ROW, count)
+                found[k].append(some["key"] * SPREAD + some["place"] * 64 + some["view"])
+    return np.array([len(np.unique(np.concatenate(cells))) for cells in found], np.int64)
+
+
+def packed(bins: Ints) -> Ints:
+    """Bins (K, 3) as one number each, (K,)."""
+    return np.asarray(bins @ np.array([1 << 40, 1 << 20, 1]))
 
 
 def reached_from(parts: Sequence[Path]) -> Floats:

@@ -27,7 +27,7 @@ from scanfind.scene import first_cell
 from scanfind.sizes import Size, Sizes, by_size
 from scanfind.sources import Scan, source_of
 from scanfind.tiles.plan import BASE_BYTES, Tile, bin_metres, margin_bins
-from scanfind.tiles.stored import Store, beams_into, count_in, parts_of, rows_in
+from scanfind.tiles.stored import Store, beams_into, count_in, parts_of, rows_in, summed_rows
 
 if TYPE_CHECKING:
     from scanfind.kernels.distance import NearSurface
@@ -152,6 +152,11 @@ def sum_up(folder: Path, job: Job, scan: Scan, number: int) -> Summed:
         return Summed(SceneScan(path, 0, 0, ()), 1, True, 0, str(error))
     store.write(grid)
     return Summed(source.told(), source.scans(), signed, left_out + grid.unaddressable)
+
+
+def count(folder: Path, parts: Sequence[Path], bins: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How many rows some bins (K, 3) have when all parts are summed, (K,)."""
+    return summed_rows(parts, bins)
 
 
 def search(
