@@ -58,6 +58,7 @@ class SearchParameters:
     overlap_ratio : λs, the share of a model's samples that must lie on the scene (the paper: 0.15) …
     facing_only : … of those that face a scanner position, where all are known: a chunky part seen from one side shows a
         quarter of its surface
+    deeper : where nothing at all is found, look for instances that show half of `overlap_ratio`
     time_limit_s : seconds for search, verification and refinement together; None: until nothing is likely to be missed
     miss_probability : stop when an instance that shows `overlap_ratio` of its surface has been missed with less than
         this chance; 0: use all of the time limit, as the paper does
@@ -80,6 +81,7 @@ class SearchParameters:
     """
 
     overlap_ratio: float = 0.3
+    deeper: bool = True
     time_limit_s: float | None = 60.0
     miss_probability: float = 0.01
     max_instances: int | None = None
@@ -153,7 +155,7 @@ class Search:
     def look_deeper(self) -> bool:
         """Look for instances that show half of λs for some rounds; False where that is done already."""
         deeper = DEEPER * self.parameters.overlap_ratio
-        if self._shown <= deeper or not self.pool_left():
+        if not self.parameters.deeper or self._shown <= deeper or not self.pool_left():
             return False
         self._look_for(deeper)
         self._until = self.effort + DEEPER_ROUNDS

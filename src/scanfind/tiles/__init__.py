@@ -294,9 +294,6 @@ def search_all(
     taken = [Found(k, one.model, one.scene_from_model) for k, one in enumerate(standing)]
     reach = 2.0 * max((one.reach for one in searched), default=0.0)
     signed = all(one.signed for one in summed)
-    tasks = {
-        f"search-{group}-{tile.name()}": (search, job, group, tile, taken, reach, signed, folders) for tile in tiles
-    }
     done = 0
 
     def told(name: str, one: Searched) -> None:
@@ -304,7 +301,16 @@ def search_all(
         done += 1
         tell("search", done, len(tiles))
 
-    return dict(zip(tiles, all_done(job.folder, crew, tasks, told), strict=True))
+    def found(deeper: bool) -> dict[Tile, Searched]:
+        name = f"search-{group}-deeper" if deeper else f"search-{group}"
+        tasks = {
+            f"{name}-{tile.name()}": (search, job, group, tile, taken, reach, signed, folders, deeper) for tile in tiles
+        }
+        return dict(zip(tiles, all_done(job.folder, crew, tasks, told), strict=True))
+
+    # As in one piece: deeper where the whole site shows nothing, not where a tile does, and most tiles do.
+    first = found(deeper=False)
+    return first if any(one.detections for one in first.values()) else found(job.parameters.search.deeper)
 
 
 def typical(found: dict[Tile, Searched]) -> list[Searched]:

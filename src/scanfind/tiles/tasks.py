@@ -161,15 +161,16 @@ def count(folder: Path, parts: Sequence[Path], bins: NDArray[np.int64]) -> NDArr
 
 def search(
     folder: Path, job: Job, group: int, tile: Tile, standing: Sequence[Found], reach: float, signed: bool,
-    scans: Sequence[Path],
+    scans: Sequence[Path], deeper: bool,
 ) -> Searched:  # fmt: skip
     """Search a tile, with its margin, for the models of one size.
 
     standing : instances of larger models; reach : how far from their surface their points may lie, metres
     scans : the folders of those summed up
+    deeper : see SearchParameters
     """
     models = by_size(job.models())[group]
-    own = replace(job.parameters, search=replace(job.parameters.search, max_instances=None))
+    own = replace(job.parameters, search=replace(job.parameters.search, max_instances=None, deeper=deeper))
     grid = grid_of(job, models, tile, signed, scans)
     taken = [Standing(surface_of(job.folder, one.model, reach), one.scene_from_model) for one in standing]
     found = Sizes(models, own)
