@@ -8,7 +8,7 @@
 
 Peak memory depends on the surface in a tile and on the library, never on the number of points. What a task gives
 depends on nothing but the scans and the parameters, so results are the same on any workers
-(decisions/0016-moments-by-bins.md).
+(decisions/0018-moments-by-bins.md).
 """
 
 from __future__ import annotations
