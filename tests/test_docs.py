@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [README, *(page.read_text(encoding="utf-8") for page in sorted((ROOT / "docs").glob("*.md")))]
 COMMANDS = [
-    ("find",), ("inspect",), ("report",), ("isolate",), ("info",), ("library", "add"), ("library", "list"),
+    ("find",), ("inspect",), ("report",), ("bim",), ("isolate",), ("info",), ("library", "add"), ("library", "list"),
     ("library", "show"), ("library", "remove"), ("simulate",),
 ]  # fmt: skip
 # Enough for the examples to come to an end; how well they find is for other tests to say.
@@ -150,6 +150,7 @@ def test_the_examples_of_every_help_run(
         "find",
         "inspect",
         "report",
+        "bim",
         "isolate",
         "info",
         "library remove",

@@ -6,6 +6,7 @@ import hashlib
 import os
 import sys
 from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
 from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -51,6 +52,7 @@ def document(
     return schema.Results(
         schema=schema.SCHEMA,
         scanfind=__version__,
+        made=datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
         seed=seed,
         parameters=to_jsonable_python(parameters),
         shift_m=findings.shift,
@@ -235,6 +237,7 @@ def _element_entry(element: Element, allowed_m: float | None) -> schema.ElementE
         through=element.through,
         hidden=element.hidden,
         why=element.why,
+        built_from_design=None if element.built_from_design is None else _rows(element.built_from_design),
     )
 
 
@@ -299,9 +302,10 @@ def _part(entry: schema.PartEntry) -> PartFit:
 
 def _element(entry: schema.ElementEntry) -> Element:
     placement = Placement(entry.global_id, entry.ifc_class, entry.name, _pose(entry.design_from_model))
+    moved = None if entry.built_from_design is None else _pose(entry.built_from_design)
     return Element(
         placement, entry.model, entry.status, entry.detection, entry.shift_m, entry.turn_rad, entry.off_m, entry.on,
-        entry.beside, entry.through, entry.hidden, entry.why,
+        entry.beside, entry.through, entry.hidden, entry.why, moved,
     )  # fmt: skip
 
 

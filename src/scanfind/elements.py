@@ -55,6 +55,8 @@ class Element:
     on, beside, through, hidden : what beams say at the design's place, as shares of the surface they went to: they
         ended on it, near it but not on it, behind it, or before it. None where no scanner position is known
     why : the evidence in words
+    built_from_design : what moves it from its place in the design to where it stands, in the design's axes about their
+        origin; without the motions the scan hardly fixes. None unless installed
     """
 
     placement: Placement
@@ -69,6 +71,7 @@ class Element:
     through: float | None
     hidden: float | None
     why: str
+    built_from_design: Pose | None = None
 
     def verdict(self, allowed_m: float | None) -> str | None:
         """Is it where it should be to within so many metres? None where it was not found or nobody says how far."""
@@ -137,7 +140,8 @@ def installed(model: Model, placement: Placement, found: Detection, spoken: Spok
     further = off_by(model, model.samples.points, found.scene_from_model, design) - off
     if further > SAID_M:
         why += f"; {1e3 * further:.0f} mm more, along a motion the scan hardly fixes, are left out"
-    return Element(placement, model.name, INSTALLED, found.id, (x, y, z), turn, off, *shares(spoken), why)
+    moved = stands @ design.inverse()
+    return Element(placement, model.name, INSTALLED, found.id, (x, y, z), turn, off, *shares(spoken), why, moved)
 
 
 def drawn_back(model: Model, found: Detection, design: Pose) -> Pose:

@@ -183,7 +183,9 @@ class ElementEntry(Entry):
     for it. `shift_m` of its middle, in the scan's axes, `turn_rad` by what angle it is turned, `off_m` how far the
     point of its surface that moved the most did; all null where it was not found. `on`, `beside`, `through`, `hidden`:
     what beams say at the design's place, as shares of the surface they went to: they ended on it, near it but not on
-    it, behind it, before it; null where no scanner position is known.
+    it, behind it, before it; null where no scanner position is known. `built_from_design` moves it from its place in
+    the design to where it stands, without the motions the scan hardly fixes: null unless it is installed, and in
+    results of an earlier version.
     """
 
     global_id: str
@@ -202,18 +204,21 @@ class ElementEntry(Entry):
     through: float | None
     hidden: float | None
     why: str
+    built_from_design: Matrix | None = None
 
 
 class Results(Entry):
     """results.json. `shift_m` was taken off while computing; every coordinate here has it added back.
 
     `tolerance_m` is within which points were isolated, null where they were not. `elements` are those of the design,
-    where a search was asked what became of it; `allowed_m` by how much they may be off.
+    where a search was asked what became of it; `allowed_m` by how much they may be off. `made`: when this was written,
+    UTC as in 2026-11-22T17:30:00Z, null in results of an earlier version.
     """
 
     schema_: int = Field(SCHEMA, alias="schema")
     scanfind: str
     seed: int
+    made: str | None = None
     parameters: dict[str, Any]
     shift_m: Vector
     crs: str | None
