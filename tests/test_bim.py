@@ -114,9 +114,9 @@ def test_a_topic_for_every_finding_as_the_schemas_want_it(inspected: Path, bars:
     assert write_bcf(inspected, tmp_path / "findings.bcf") == 2
     topics = checked(tmp_path / "findings.bcf")
     assert len(topics) == 2
-    [off] = [topic for title, topic in topics.items() if title.startswith("off: ")]
+    [off] = [topic for title, topic in topics.items() if title.startswith("off: installed, ")]
     [lost] = [topic for title, topic in topics.items() if title.endswith(": not found")]
-    assert "allowed are 10 mm" in off["markup.bcf"].findtext("Topic/Description")
+    assert "Allowed: 10 mm." in off["markup.bcf"].findtext("Topic/Description")
     ids = {p.name: p.global_id for mesh in read_models(bars) if isinstance(mesh, Mesh) for p in mesh.placements}
     for topic, name in ((off, "off"), (lost, ODD)):
         view = topic["viewpoint.bcfv"]
@@ -170,7 +170,8 @@ def test_a_camera_is_taken_that_walls_do_not_block() -> None:
 
 
 def test_what_was_allowed_may_be_changed_afterwards(inspected: Path, tmp_path: Path) -> None:
-    assert write_bcf(inspected, tmp_path / "wide.bcf", allowed=0.1) == 1
+    (tmp_path / "wide.toml").write_text("[[rule]]\noff_mm = 100.0\n")
+    assert write_bcf(inspected, tmp_path / "wide.bcf", tolerance=tmp_path / "wide.toml") == 1
     assert list(checked(tmp_path / "wide.bcf")) == [f"{plain(ODD)}: not found"]
 
 
@@ -277,9 +278,10 @@ def test_without_move_only_properties_are_new(inspected: Path, bars: Path, tmp_p
     first = properties(tmp_path / "told.ifc")
     assert set(first) == {"as designed", "off", ODD}
     # Told again of what was told already, a file has the new description alone.
-    write_as_built(inspected, tmp_path / "told.ifc", tmp_path / "again.ifc", allowed=0.5)
+    (tmp_path / "wide.toml").write_text("[[rule]]\noff_mm = 100.0\n")
+    write_as_built(inspected, tmp_path / "told.ifc", tmp_path / "again.ifc", tolerance=tmp_path / "wide.toml")
     second = properties(tmp_path / "again.ifc")
-    assert (first["off"]["Verdict"], second["off"]["Verdict"]) == ("out_of_tolerance", "in_tolerance")
+    assert (first["off"]["Verdict"], second["off"]["Verdict"]) == ("out_of_tolerance", "not_judged")  # no detection
     assert (tmp_path / "again.ifc").read_text().count("IFCPROPERTYSET(") == 3
 
 
@@ -394,7 +396,7 @@ def test_the_command_says_what_is_missing(inspected: Path, tmp_path: Path, capsy
     for flags, words in (
         ([], "nothing to write"), (["--ifc", str(tmp_path / "a.ifc")], "give both"), (["--move"], "nothing to write"),
         (["--bcf", str(tmp_path / "a.bcf"), "--move"], "give both"),
-        (["--bcf", str(tmp_path / "a.bcf"), "--allowed", "-1"], "a length above 0"),
+        (["--bcf", str(tmp_path / "a.bcf"), "--tolerance", "steal"], "neither a TOML file nor"),
     ):  # fmt: skip
         assert main(["bim", str(inspected), *flags]) == 2
         assert words in capsys.readouterr().err

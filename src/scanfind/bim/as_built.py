@@ -11,8 +11,7 @@ from uuid import UUID, uuid5
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.bim.bcf import inspected
-from scanfind.bim.wording import judged
+from scanfind.bim.wording import inspected, scans_in_words
 from scanfind.errors import OutputError, ScanfindError, UnreadableFileError, UsageError
 from scanfind.models.child import need_extra, one_line
 from scanfind.models.ifc_select import members
@@ -39,21 +38,21 @@ class Told(NamedTuple):
 
 
 def write_as_built(
-    result_dir: str | Path, design: str | Path, out: str | Path, *, move: bool = False, allowed: float | None = None,
-    overwrite: bool = False,
+    result_dir: str | Path, design: str | Path, out: str | Path, *, move: bool = False,
+    tolerance: str | Path | None = None, overwrite: bool = False,
 ) -> Told:  # fmt: skip
     """Write a copy of the design with a property set `scanfind_AsBuilt` on every element that was inspected.
 
     result_dir : a folder that `scanfind inspect --out` wrote
     design : the IFC file that was inspected; it is not changed
     move : place installed elements where they were found, with their openings and, of an assembly, its parts
-    allowed : by how much an element may be off, metres; None as when it was inspected
+    tolerance : a profile (a TOML file or the name of a preset) that gives the verdicts; None: as inspected
 
     Raises UnreadableFileError for a file that is no IFC file, UsageError where it is not the design of the result,
     MissingExtraError without ifcopenshell, OutputError where `out` is the design itself or cannot be written.
     """
     need_extra("ifcopenshell", "ifc", "IFC")
-    results = judged(inspected(result_dir), allowed)
+    results, _ = inspected(result_dir, tolerance)
     if not Path(design).is_file():
         msg = f"{design}: {'not a file' if Path(design).exists() else 'no such file'}"
         raise UnreadableFileError(msg)
@@ -160,8 +159,7 @@ class Properties:
         self._file, self._results = file, results
         self._length = calculate_unit_scale(file)
         self._angle = calculate_unit_scale(file, "PLANEANGLEUNIT")
-        scans = [scan.path.replace("\\", "/").rpartition("/")[2] for scan in results.scans]
-        self._scans, self._dates = ", ".join(scans), file.schema != "IFC2X3"
+        self._scans, self._dates = scans_in_words(results), file.schema != "IFC2X3"
 
     def write(self, product: Any, element: ElementEntry, found: DetectionEntry | None, *, moved: bool) -> None:
         """Describe a product, in the place of an earlier description."""

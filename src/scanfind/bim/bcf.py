@@ -16,16 +16,17 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 import numpy as np
 
-from scanfind.bim.views import FIELD_OF_VIEW, Camera, Colour, Shown, Views, png
-from scanfind.bim.wording import description, is_finding, judged, title
+from scanfind.bim.views import FIELD_OF_VIEW, Camera, Colour, Shown, Views
+from scanfind.bim.wording import description, inspected, is_finding, title
 from scanfind.elements import INSTALLED, NO_DATA, NOT_ENOUGH_DATA, NOT_FOUND, OCCLUDED, UNCERTAIN
 from scanfind.errors import UsageError
 from scanfind.library import ModelLibrary
+from scanfind.picture import png
 from scanfind.pose import Pose
-from scanfind.results import MODELS, RESULTS_JSON, read_results, result_file
+from scanfind.results import MODELS, RESULTS_JSON, result_file
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from scanfind.schema import ElementEntry, Results
 
@@ -43,26 +44,29 @@ NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 class Topic(NamedTuple):
-    """A finding: its element, and from where to look at it."""
+    """A finding: its element, what is told of it, from where to look at it, and what is seen (PNG)."""
 
     guid: UUID
     element: ElementEntry
+    told: str
     camera: Camera
     picture: bytes
 
 
-def write_bcf(result_dir: str | Path, out: str | Path, *, allowed: float | None = None, overwrite: bool = False) -> int:
+def write_bcf(
+    result_dir: str | Path, out: str | Path, *, tolerance: str | Path | None = None, overwrite: bool = False
+) -> int:
     """Write a topic for every element of an inspection that somebody has to look at; returns how many.
 
     result_dir : a folder that `scanfind inspect --out` wrote
-    allowed : by how much an element may be off, metres; None as when it was inspected
+    tolerance : a profile (a TOML file or the name of a preset) that says what is out of tolerance; None: as inspected
 
     Raises UnreadableFileError for no result, UsageError where it is not of a design, LibraryError, OutputError.
     """
-    results = judged(inspected(result_dir), allowed)
+    results, judgements = inspected(result_dir, tolerance)
     made = results.made or _written(Path(result_dir))
     with result_file(out, overwrite=overwrite) as path, ZipFile(path, "w", ZIP_DEFLATED, compresslevel=9) as archive:
-        topics = topics_of(results, result_dir, made)
+        topics = topics_of(results, judgements, Path(result_dir) / MODELS, made)
         when = datetime.strptime(made, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC).timetuple()[:6]
 
         def put(name: str, data: bytes) -> None:
@@ -78,31 +82,24 @@ def write_bcf(result_dir: str | Path, out: str | Path, *, allowed: float | None 
         for index, topic in enumerate(topics):
             folder = f"{topic.guid}/"
             put(folder, b"")
-            put(folder + "markup.bcf", _xml(_markup(topic, index, results, made)))
+            put(folder + "markup.bcf", _xml(_markup(topic, index, made)))
             put(folder + "viewpoint.bcfv", _xml(_viewpoint(topic)))
             put(folder + "snapshot.png", topic.picture)
     return len(topics)
 
 
-def inspected(result_dir: str | Path) -> Results:
-    """The result of an inspection; raises UsageError where it is of another search."""
-    results = read_results(result_dir)
-    if not results.elements:
-        msg = f"{result_dir}: a result without a design: name one of `scanfind inspect --out`"
-        raise UsageError(msg)
-    return results
-
-
-def topics_of(results: Results, result_dir: str | Path, made: str) -> list[Topic]:
-    """The findings in the order of the elements."""
-    views = Views(shown(results.elements, Path(result_dir) / MODELS))
+def topics_of(results: Results, judgements: Mapping[int, str], models: Path, made: str) -> list[Topic]:
+    """The findings in the order of the elements; judgements : see `inspected`; models : the library of their shapes."""
+    views = Views(shown(results.elements, models))
     topics = []
     for number, element in enumerate(results.elements):
         if is_finding(element):
             camera = views.camera(number)
             # A design of meshes has no GlobalIds: the place in the list tells elements apart.
             guid = uuid5(SPACE, f"{made} {number} {element.global_id} {element.status}")
-            topics.append(Topic(guid, element, camera, png(views.picture(number, camera, COLOURS[element.status]))))
+            told = description(results, element, judgements.get(number, ""))
+            picture = png(views.picture(number, camera, COLOURS[element.status]))
+            topics.append(Topic(guid, element, told, camera, picture))
     return topics
 
 
@@ -128,16 +125,15 @@ def _version() -> Element:
     return root
 
 
-def _markup(topic: Topic, index: int, results: Results, made: str) -> Element:
+def _markup(topic: Topic, index: int, made: str) -> Element:
     """markup.bcf; the schema wants its elements in this order."""
     element, view = topic.element, str(uuid5(topic.guid, "viewpoint"))
-    found = next((each for each in results.detections if each.id == element.detection), None)
     root = Element("Markup")
     about = SubElement(root, "Topic", Guid=str(topic.guid), TopicType="Issue", TopicStatus="Open")
     for tag, text in (
         ("Title", title(element)), ("Priority", PRIORITY.get(element.status, "Low")), ("Index", str(index)),
         ("Labels", (element.verdict or element.status).replace("_", " ")), ("CreationDate", made),
-        ("CreationAuthor", AUTHOR), ("Description", description(element, found, results)),
+        ("CreationAuthor", AUTHOR), ("Description", topic.told),
     ):  # fmt: skip
         SubElement(about, tag).text = plain(text)
     look = SubElement(root, "Viewpoints", Guid=view)

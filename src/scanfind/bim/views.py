@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -121,19 +119,6 @@ def camera_at(middle: Floats, distance: float, way: Floats) -> Camera:
     right = np.cross(-way, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     return Camera(middle + distance * way, -way, np.cross(right, -way))
-
-
-def png(image: NDArray[np.uint8]) -> bytes:
-    """An image (height, width, 3) as a PNG file, the same bytes every time."""
-    height, width, _ = image.shape
-    rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, -1)], axis=1)  # 0: no filter
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    packed = zlib.compress(rows.tobytes(), 9)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", packed) + chunk(b"IEND", b"")
 
 
 def _image(pixels: Floats) -> NDArray[np.uint8]:

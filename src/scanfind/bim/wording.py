@@ -1,14 +1,32 @@
-"""What a finding is called and what is said of it, in the words of a building site."""
+"""Which elements somebody has to look at, and what a BIM tool shows of them."""
 
 from __future__ import annotations
 
 from math import degrees
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scanfind.elements import INSTALLED, OUT_OF_TOLERANCE
+from scanfind.errors import UsageError
+from scanfind.explain import element_sentences, headline
+from scanfind.results import MODELS, read_results
 
 if TYPE_CHECKING:
-    from scanfind.schema import DetectionEntry, ElementEntry, Results
+    from scanfind.schema import ElementEntry, Results
+
+
+def inspected(result_dir: str | Path, tolerance: str | Path | None = None) -> tuple[Results, dict[int, str]]:
+    """The result of an inspection, and by place among its elements why a profile gives them the verdicts they have.
+
+    tolerance : a profile, see `load_profile`; None: the verdicts are those of the inspection
+
+    Raises UnreadableFileError for no result, UsageError where it is of no design or for no profile.
+    """
+    results = read_results(result_dir)
+    if not results.elements:
+        msg = f"{result_dir}: a result without a design: name one of `scanfind inspect --out`"
+        raise UsageError(msg)
+    return (results, {}) if tolerance is None else _judged(results, Path(result_dir), tolerance)
 
 
 def is_finding(element: ElementEntry) -> bool:
@@ -16,57 +34,46 @@ def is_finding(element: ElementEntry) -> bool:
     return element.status != INSTALLED or element.verdict == OUT_OF_TOLERANCE
 
 
-def named(element: ElementEntry) -> str:
-    """What people call an element."""
-    return element.name or element.model
-
-
 def title(element: ElementEntry) -> str:
     """One line: which element, and what is the matter with it."""
-    if element.status == INSTALLED and element.shift_m is not None:
-        return f"{named(element)}: {off_in_words(element)}"
-    return f"{named(element)}: {element.status.replace('_', ' ')}"
+    return f"{element.name or element.model}: {headline(element)}"
 
 
-def off_in_words(element: ElementEntry) -> str:
-    """How far off: "12 mm low", if it is mostly that; else how far the point that moved the most did."""
-    off, (x, y, z) = element.off_m or 0.0, element.shift_m or (0.0, 0.0, 0.0)
-    if abs(z) > 0.8 * off and abs(z) > 2.0 * max(abs(x), abs(y)):
-        return f"{1e3 * abs(z):.0f} mm {'high' if z > 0.0 else 'low'}"
-    return f"{1e3 * off:.0f} mm off"
+def description(results: Results, element: ElementEntry, judgement: str) -> str:
+    """Some lines: the evidence, how far off in which direction, what is allowed, of which scans.
 
-
-def description(element: ElementEntry, found: DetectionEntry | None, results: Results) -> str:
-    """Some lines: the evidence, how far off in which direction, of what scans.
-
-    found : the instance taken for it
+    judgement : of a tolerance profile
     """
-    lines = [element.why[:1].upper() + element.why[1:] + "."]
-    if element.shift_m is not None and element.off_m is not None:
+    lines = [*element_sentences(results, element)]
+    if element.shift_m is not None:
         x, y, z = (1e3 * value for value in element.shift_m)
         turn = degrees(element.turn_rad or 0.0)
-        lines += [
-            f"Its middle is off by x {x:+.1f}, y {y:+.1f}, z {z:+.1f} mm, and it is turned by {turn:.2f}°.",
-            f"The point of its surface that moved the most is off by {1e3 * element.off_m:.1f} mm"
-            + ("." if results.allowed_m is None else f"; allowed are {1e3 * results.allowed_m:g} mm."),
-        ]
-    if found is not None and found.deviation is not None and found.deviation.rms_m is not None:
-        lines.append(f"Its {found.points:,} points lie {1e3 * found.deviation.rms_m:.1f} mm (rms) about its surface.")
-    scans = ", ".join(scan.path.replace("\\", "/").rpartition("/")[2] for scan in results.scans)
-    lines.append(
-        f"Scans: {scans}. Inspected {results.made or 'at a time that is not known'}, scanfind {results.scanfind}."
-    )
+        lines.append(f"Shift of its middle: x {x:+.1f}, y {y:+.1f}, z {z:+.1f} mm; turned by {turn:.2f}°.")
+    if judgement:
+        lines.append(f"{judgement[:1].upper()}{judgement[1:]}.")
+    elif results.allowed_m is not None and element.verdict is not None:
+        lines.append(f"Allowed: {1e3 * results.allowed_m:g} mm.")
+    lines.append(f"Scans: {scans_in_words(results)}; inspected {results.made or 'at an unknown time'}.")
     return "\n".join(lines)
 
 
-def judged(results: Results, allowed_m: float | None) -> Results:
-    """The same with the verdicts that so much (metres) gives; None: as they are."""
-    from scanfind.document import findings_of
+def scans_in_words(results: Results) -> str:
+    """The names of the scan files, without their folders."""
+    return ", ".join(scan.path.replace("\\", "/").rpartition("/")[2] for scan in results.scans) or "unknown"
 
-    if allowed_m is None:
-        return results
-    verdicts = [element.verdict(allowed_m) for element in findings_of(results).elements]
+
+def _judged(results: Results, folder: Path, tolerance: str | Path) -> tuple[Results, dict[int, str]]:
+    from scanfind.library import ModelLibrary
+    from scanfind.tolerances import judge_element, load_profile
+    from scanfind.tolerances.discs import discs_of
+
+    profile = load_profile(tolerance)
+    with ModelLibrary.open(folder / MODELS) as library:
+        discs = {key: disc for model in library.models() for key, disc in discs_of(model).items()}
+    judgements = [judge_element(profile, results, element, discs) for element in results.elements]
     elements = [
-        entry.model_copy(update={"verdict": verdict}) for entry, verdict in zip(results.elements, verdicts, strict=True)
+        element.model_copy(update={"verdict": judgement.verdict if element.status == INSTALLED else None})
+        for element, judgement in zip(results.elements, judgements, strict=True)
     ]
-    return results.model_copy(update={"elements": elements, "allowed_m": allowed_m})
+    why = {place: judgement.why for place, judgement in enumerate(judgements) if elements[place].verdict is not None}
+    return results.model_copy(update={"elements": elements, "allowed_m": None}), why

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scanfind.cli.options import Flag, Metres, note
+from scanfind.cli.options import Flag, note
 from scanfind.errors import UsageError
 
 
@@ -16,7 +16,7 @@ def bim(
     ifc: Path | None = None,
     design: Path | None = None,
     move: Flag = False,
-    allowed: Metres | None = None,
+    tolerance: str | None = None,
     overwrite: Flag = False,
 ) -> None:
     """Bring an inspection back into the BIM: its findings as BCF issues, and an IFC file that says what was built.
@@ -38,8 +38,8 @@ def bim(
         The IFC file that was inspected; it is not changed.
     move
         In --ifc, place what is installed where it was found.
-    allowed
-        By how much an element may be off, metres; as in the inspection unless given.
+    tolerance
+        What is out of tolerance: a TOML profile, or pipe-spools or structural-steel; as in the inspection unless given.
     overwrite
         Replace older files at --bcf and --ifc.
 
@@ -50,14 +50,11 @@ def bim(
     if (ifc is None) != (design is None) or (move and ifc is None):
         msg = "bim: --ifc, which --move goes with, is a copy of the design: give both --ifc FILE and --design FILE"
         raise UsageError(msg)
-    if allowed is not None and not allowed > 0.0:
-        msg = f"bim: --allowed is a length above 0, in metres, got {allowed:g}"
-        raise UsageError(msg)
 
     if ifc is not None and design is not None:
         from scanfind.bim.as_built import write_as_built
 
-        told = write_as_built(result_dir, design, ifc, move=move, allowed=allowed, overwrite=overwrite)
+        told = write_as_built(result_dir, design, ifc, move=move, tolerance=tolerance, overwrite=overwrite)
         moved = f", {told.moved} moved to where they stand" if move else ""
         note(f"{told.described} elements described{moved}: {ifc}")
         if told.unmoved:
@@ -67,4 +64,4 @@ def bim(
     if bcf is not None:
         from scanfind.bim.bcf import write_bcf
 
-        note(f"{write_bcf(result_dir, bcf, allowed=allowed, overwrite=overwrite)} topics: {bcf}")
+        note(f"{write_bcf(result_dir, bcf, tolerance=tolerance, overwrite=overwrite)} topics: {bcf}")
