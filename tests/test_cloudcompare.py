@@ -41,8 +41,8 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "found"
 
 
-def cloudcompare(folder: Path, *arguments: str | Path) -> np.ndarray:
-    """What CloudCompare saves as text: a row a point."""
+def cloudcompare(folder: Path, *arguments: str | Path) -> dict[str, np.ndarray]:
+    """What CloudCompare saves as text: column by column, a row a point."""
     out = folder / "out.asc"
     command = ["CloudCompare", "-SILENT", "-NO_TIMESTAMP", "-AUTO_SAVE", "OFF", "-C_EXPORT_FMT", "ASC", "-PREC", "9"]
     command += ["-ADD_HEADER", *map(str, arguments), "-SAVE_CLOUDS", "FILE", str(out)]
@@ -52,7 +52,7 @@ def cloudcompare(folder: Path, *arguments: str | Path) -> np.ndarray:
     head, *rows = out.read_text().splitlines()
     names = head.removeprefix("//").split()
     table = np.array([row.split() for row in rows], np.float64)
-    return np.rec.fromarrays(table.T, names=names)
+    return dict(zip(names, table.T, strict=True))
 
 
 def test_a_pose_file_puts_the_model_where_it_was_found(found: Path, tmp_path: Path) -> None:
@@ -61,7 +61,7 @@ def test_a_pose_file_puts_the_model_where_it_was_found(found: Path, tmp_path: Pa
     np.savetxt(tmp_path / "corners.xyz", BRACKET.vertices, fmt="%.9f")
     moved = cloudcompare(tmp_path, "-O", tmp_path / "corners.xyz", "-APPLY_TRANS", found / detection.pose)
     expected = Pose.from_matrix(detection.scene_from_model).move(BRACKET.vertices)
-    np.testing.assert_allclose(np.stack([moved.X, moved.Y, moved.Z], axis=1), expected, atol=1e-6)
+    np.testing.assert_allclose(np.stack([moved[axis] for axis in "XYZ"], axis=1), expected, atol=1e-6)
     np.testing.assert_allclose(expected, STANDS.move(BRACKET.vertices), atol=5e-4)
 
 
@@ -74,8 +74,8 @@ def test_fields_arrive_and_distances_to_the_mesh_are_ours(found: Path, tmp_path:
     faces = "".join(f"f {a} {b} {c}\n" for a, b, c in (BRACKET.faces + 1).tolist())
     (tmp_path / "model.obj").write_text(corners + faces)
     arrived = cloudcompare(tmp_path, "-O", found / detection.isolated, "-O", tmp_path / "model.obj", "-C2M_DIST")
-    assert len(arrived) == len(chunk.xyz) > 10_000
-    np.testing.assert_allclose(np.stack([arrived.X, arrived.Y, arrived.Z], axis=1), chunk.xyz, atol=1e-6)
+    assert len(arrived["X"]) == len(chunk.xyz) > 10_000
+    np.testing.assert_allclose(np.stack([arrived[axis] for axis in "XYZ"], axis=1), chunk.xyz, atol=1e-6)
     for name, values in chunk.attributes.items():
         np.testing.assert_allclose(arrived[name], values.astype(np.float32), rtol=1e-6, atol=1e-8)
     distances = arrived["C2M_signed_distances"]

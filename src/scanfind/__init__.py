@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from scanfind.detection import Detection, Findings
     from scanfind.errors import ScanfindError
     from scanfind.find import find
+    from scanfind.inspect import inspect
     from scanfind.isolate import isolate
     from scanfind.library import ModelLibrary
     from scanfind.mesh import Mesh
@@ -46,6 +47,7 @@ __all__ = [
     "Symmetry",
     "__version__",
     "find",
+    "inspect",
     "isolate",
     "pose_error",
     "read_models",
@@ -64,6 +66,7 @@ _HOME = {
     "PRESETS": "parameters",
     "Parameters": "parameters",
     "find": "find",
+    "inspect": "inspect",
     "isolate": "isolate",
     "ModelLibrary": "library",
     "Mesh": "mesh",

@@ -151,13 +151,22 @@ def drawn_back(model: Model, found: Detection, design: Pose) -> Pose:
         return alike
     middle = found.scene_from_model.inverse().move(np.array(found.pivot)[None])
     radius = 0.5 * model.diameter
-    scale = np.array([radius] * 3 + [1.0] * 3)
-    information = np.asarray(
-        np.linalg.pinv(found.covariance * np.outer(scale, scale), rcond=1e-9, hermitian=True), np.float64
-    )
+    information = information_of(found, radius)
     # The pivot is in the middle of what was seen; a symmetry may have turned that elsewhere.
     there = alike.inverse().move(found.scene_from_model.move(middle))[0]
     return held(design, alike, information, there, radius)
+
+
+def information_of(found: Detection, radius: float) -> Floats:
+    """What the scan says of the motions (rotation × radius, translation of the pivot) of an instance, (6, 6), 1/m².
+
+    As if it said the same of all of them where there is no covariance; radius : of the model, metres.
+    """
+    if found.covariance is None:
+        return np.eye(6)
+    scale = np.array([radius] * 3 + [1.0] * 3)
+    inverse = np.linalg.pinv(found.covariance * np.outer(scale, scale), rcond=1e-9, hermitian=True)
+    return np.asarray(inverse, np.float64)
 
 
 def missed(model: Model, placement: Placement, spoken: Spoken | None) -> Element:

@@ -6,9 +6,13 @@ from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from scanfind.document import rows
 from scanfind.elements import INSTALLED, OUT_OF_TOLERANCE
 from scanfind.errors import UsageError
 from scanfind.explain import element_sentences, headline
+from scanfind.pose import Pose
 from scanfind.results import MODELS, read_results
 
 if TYPE_CHECKING:
@@ -16,17 +20,45 @@ if TYPE_CHECKING:
 
 
 def inspected(result_dir: str | Path, tolerance: str | Path | None = None) -> tuple[Results, dict[int, str]]:
-    """The result of an inspection, and by place among its elements why a profile gives them the verdicts they have.
+    """The result of an inspection, in the axes of the design; by place among the elements why a profile judges them so.
 
     tolerance : a profile, see `load_profile`; None: the verdicts are those of the inspection
 
     Raises UnreadableFileError for no result, UsageError where it is of no design or for no profile.
     """
-    results = read_results(result_dir)
+    results, why = read_results(result_dir), dict[int, str]()
     if not results.elements:
         msg = f"{result_dir}: a result without a design: name one of `scanfind inspect --out`"
         raise UsageError(msg)
-    return (results, {}) if tolerance is None else _judged(results, Path(result_dir), tolerance)
+    if tolerance is not None:
+        results, why = _judged(results, Path(result_dir), tolerance)
+    return in_design(results), why
+
+
+def in_design(results: Results) -> Results:
+    """A result in the axes of the design, where it was found that the scans have others."""
+    if results.alignment is None:
+        return results
+    design_from_scene = Pose.from_matrix(results.alignment.scene_from_design).inverse()
+    scene_from_design = design_from_scene.inverse()
+    elements = []
+    for element in results.elements:
+        changed: dict[str, object] = {
+            "design_from_model": rows(design_from_scene @ Pose.from_matrix(element.design_from_model))
+        }
+        if element.shift_m is not None:
+            changed["shift_m"] = tuple(design_from_scene.turn(np.array([element.shift_m]))[0].tolist())
+        if element.built_from_design is not None:
+            motion = Pose.from_matrix(element.built_from_design)
+            changed["built_from_design"] = rows(design_from_scene @ motion @ scene_from_design)
+        elements.append(element.model_copy(update=changed))
+    detections = [
+        found.model_copy(
+            update={"scene_from_model": rows(design_from_scene @ Pose.from_matrix(found.scene_from_model))}
+        )
+        for found in results.detections
+    ]
+    return results.model_copy(update={"elements": elements, "detections": detections})
 
 
 def is_finding(element: ElementEntry) -> bool:
