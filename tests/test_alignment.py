@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import scanfind
-from scanfind.alignment import Alignment, align
+from scanfind.alignment import CELL_M, Alignment, fitted, lies_at
 from scanfind.bim.wording import inspected as in_bim
 from scanfind.detection import Detection
 from scanfind.document import findings_of
@@ -25,6 +25,7 @@ from scanfind.simulate.parts import blocks, box, cylinder
 from scanfind.simulate.scanner import Scanner, scan
 from scanfind.simulate.scene import Scene, SceneObject
 from scanfind.surface import SurfaceParameters
+from scanfind.thinned import Thinned
 
 SMALL = ModelParameters(SurfaceParameters(samples=100))
 ODD = blocks("odd", [((0, 0, 0), (1, 0.3, 0.1)), ((0, 0, 0), (0.1, 0.3, 0.7)), ((0.5, 0, 0), (0.6, 0.1, 0.4))])
@@ -44,9 +45,10 @@ def design(rng: np.random.Generator, *counted: tuple[Mesh, int]) -> list[Model]:
 
 def found(
     models: list[Model], scene_from_design: Pose, rng: np.random.Generator, *, off: float = 0.0, left_out: float = 0.0
-) -> list[Detection]:
-    """The elements as found in the scene: each somewhat off, some not at all, any way round that looks the same."""
+) -> tuple[list[Detection], np.ndarray]:
+    """The elements as found in the scene, each somewhat off, some not at all, any way round; and its points (N, 3)."""
     detections: list[Detection] = []
+    points = [np.empty((0, 3))]
     for model in models:
         centre, radius = model.symmetry.centre, 0.5 * model.diameter
         for placement in model.placements:
@@ -57,9 +59,14 @@ def found(
             jolt = rotation_from_vector(rng.normal(size=3) * off / radius)
             shift = centre + rng.normal(size=3) * off - jolt @ centre
             pose = scene_from_design @ placement.design_from_model @ turn @ Pose(jolt, shift)
-            x, y, z = pose.move(centre[None])[0].tolist()
-            detections.append(detection(len(detections) + 1, model.name, pose, (x, y, z)))
-    return detections
+            detections.append(detection(len(detections) + 1, model.name, pose, triple(pose.move(centre[None])[0])))
+            points.append(pose.move(model.samples.points))
+    return detections, np.concatenate(points)
+
+
+def aligned(models: list[Model], seen: tuple[list[Detection], np.ndarray], *, upright: bool = False) -> Alignment:
+    detections, points = seen
+    return fitted(models, detections, lies_at(models, detections, Thinned([points], CELL_M), upright=upright))
 
 
 def detection(number: int, model: str, pose: Pose, pivot: tuple[float, float, float] | None = None) -> Detection:
@@ -78,26 +85,26 @@ def error(told: Alignment, truth: Pose) -> np.ndarray:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=3, deadline=None)
 def test_it_moves_with_the_scan(seed: int) -> None:
     rng = np.random.default_rng(seed)
     models = design(rng, (ODD, 3), (BEAM, 8))
     truth, move = anywhere(rng), anywhere(rng)
-    detections = found(models, truth, rng, off=0.005, left_out=0.2)
+    detections, points = found(models, truth, rng, off=0.005, left_out=0.2)
     if len(detections) < 6:
         return
-    one = align(models, detections)
+    one = aligned(models, (detections, points))
     moved = [
         replace(
             each, scene_from_model=move @ each.scene_from_model, pivot=triple(move.move(np.array(each.pivot)[None])[0])
         )
         for each in detections
     ]
-    other = align(models, moved)
+    other = aligned(models, (moved, move.move(points)))
     expected = (move @ one.scene_from_design).matrix()
-    np.testing.assert_allclose(other.scene_from_design.matrix(), expected, atol=1e-7)
+    np.testing.assert_allclose(other.scene_from_design.matrix(), expected, atol=1e-5)
     assert (one.agreeing, one.found) == (other.agreeing, other.found)
-    assert one.sigma_m == pytest.approx(other.sigma_m, rel=1e-4)
+    assert one.sigma_m == pytest.approx(other.sigma_m, rel=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -105,11 +112,11 @@ def test_far_from_everything_with_false_ones_among_the_instances(seed: int) -> N
     rng = np.random.default_rng(seed)
     models = design(rng, (ODD, 2), (BEAM, 12), (ROD, 3))
     truth = anywhere(rng, far=1e4)
-    detections = found(models, truth, rng, off=0.004, left_out=0.2)
+    detections, points = found(models, truth, rng, off=0.004, left_out=0.2)
     good = len(detections)
     for k in range(8):
         detections.append(detection(1000 + k, "beam", truth @ anywhere(rng, far=0.2)))
-    told = align(models, detections)
+    told = aligned(models, (detections, points))
     assert good - 1 <= told.agreeing <= good + 1
     assert told.found == len(detections)
     assert np.abs(error(told, truth)[3:]).max() < 0.01
@@ -119,22 +126,22 @@ def test_far_from_everything_with_false_ones_among_the_instances(seed: int) -> N
 
 def test_it_is_as_uncertain_as_told() -> None:
     scores = []
-    for seed in range(25):
+    for seed in range(8):
         rng = np.random.default_rng(seed)
         models = design(rng, (ODD, 4), (BEAM, 10))
         truth = anywhere(rng)
-        told = align(models, found(models, truth, rng, off=0.005))
+        told = aligned(models, found(models, truth, rng, off=0.005))
         off = error(told, truth)
         scores.append(off @ np.linalg.solve(told.covariance, off))
     # The squared error over its covariance has six degrees of freedom, some more since the spread is measured too.
-    assert 4.5 < np.mean(scores) < 9.0
+    assert 4.0 < np.mean(scores) < 9.0
 
 
 def test_what_slides_along_itself_does_not_carry_the_design_off() -> None:
     rng = np.random.default_rng(7)
     models = design(rng, (BEAM, 12), (ODD, 2))
     truth = anywhere(rng)
-    detections = found(models, truth, rng, off=0.002)
+    detections, points = found(models, truth, rng, off=0.002)
     slid = []
     for each in detections:
         if each.model != "beam":
@@ -147,7 +154,7 @@ def test_what_slides_along_itself_does_not_carry_the_design_off() -> None:
         pose = Pose(each.scene_from_model.rotation, each.scene_from_model.translation + shift)
         pivot = triple(np.array(each.pivot) + shift)
         slid.append(replace(each, scene_from_model=pose, pivot=pivot, covariance=covariance))
-    told = align(models, slid)
+    told = aligned(models, (slid, points))
     assert told.agreeing == 14
     assert np.abs(error(told, truth)[3:]).max() < 0.004
 
@@ -164,14 +171,12 @@ def frame() -> list[Model]:
 def test_a_symmetric_building_is_refused_unless_something_in_it_is_not() -> None:
     rng = np.random.default_rng(3)
     models, truth = frame(), anywhere(rng)
-    detections = found(models, truth, rng, off=0.003)
-    with pytest.raises(AlignmentError, match=r"aligned in two ways: 8 elements agree on one, 8 on one turned by 180°"):
-        align(models, detections)
+    with pytest.raises(AlignmentError, match=r"two ways: 8 elements lie on the scan in one, 8 in one turned by 180°"):
+        aligned(models, found(models, truth, rng, off=0.003))
     odd = [Pose(random_rotation(rng), np.array(at)) for at in ((1.0, 0.5, 0.0), (4.0, 1.5, 1.0), (2.0, 3.3, 2.0))]
     places = tuple(Placement(f"odd{k}", "IfcPlate", "odd", pose) for k, pose in enumerate(odd))
     models.append(build_model(replace(ODD, placements=places), SMALL))
-    detections = found(models, truth, rng, off=0.003)
-    told = align(models, detections)
+    told = aligned(models, found(models, truth, rng, off=0.003))
     assert told.agreeing == 11
     assert np.abs(error(told, truth)).max() < 0.01
 
@@ -184,29 +189,63 @@ def test_upright_tells_what_is_upside_down() -> None:
     centred = replace(BEAM, vertices=BEAM.vertices - BEAM.vertices.mean(axis=0), placements=places)
     models = [build_model(centred, SMALL)]
     truth = Pose.from_rotation_vector((0.0, 0.0, 2.0), (30.0, -4.0, 1.0))
-    detections = found(models, truth, rng, off=0.002)
+    seen = found(models, truth, rng, off=0.002)
     with pytest.raises(AlignmentError, match="in two ways"):
-        align(models, detections)
-    told = align(models, detections, upright=True)
+        aligned(models, seen)
+    told = aligned(models, seen, upright=True)
     assert told.agreeing == 6
     assert np.abs(error(told, truth)).max() < 0.01
+
+
+def test_of_instances_that_are_wrong_but_one_the_surface_tells() -> None:
+    """Of one section every piece looks like part of every longer one: where they are says little, what fits does."""
+    rng = np.random.default_rng(11)
+    models = design(rng, (ODD, 3), (BEAM, 15))
+    truth = anywhere(rng)
+    detections, points = found(models, truth, rng)
+    wrong = [detection(100 + k, "beam", truth @ anywhere(rng, far=0.2)) for k in range(30)]
+    start = lies_at(models, [*wrong, detections[0]], Thinned([points], CELL_M))
+    shift, angle = start.difference(truth)
+    assert shift < 0.02
+    assert angle < 0.002
+
+
+def test_thinned_points_are_what_is_near() -> None:
+    rng = np.random.default_rng(2)
+    far = np.array([5e5, -5e6, 0.0])
+    points = rng.uniform(0, 2, (4000, 3)) + far
+    one = Thinned([points], 0.1)
+    other = Thinned([points[:7], np.empty((0, 3)), points[7:]], 0.1)
+    np.testing.assert_allclose(other.means, one.means, atol=1e-9)
+    asked = rng.uniform(-0.5, 2.5, (300, 3)) + far
+    distance, which = one.nearest(asked)
+    exact = np.linalg.norm(asked[:, None] - one.means[None], axis=2)
+    near = exact.min(axis=1) < 0.1
+    np.testing.assert_allclose(distance[near], exact.min(axis=1)[near], rtol=1e-6)
+    np.testing.assert_array_equal(which[near], exact.argmin(axis=1)[near])
+    assert (distance[~near] >= 0.1).all()
+    assert np.isinf(Thinned([], 0.1).nearest(asked)[0]).all()
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_are_no_alignment(count: int) -> None:
     rng = np.random.default_rng(count)
     models = design(rng, (ODD, 4))
-    detections = found(models, anywhere(rng), rng)[:count]
+    truth = anywhere(rng)
+    detections, points = found(models, truth, rng)
     with pytest.raises(AlignmentError, match="the design cannot be aligned") as caught:
-        align(models, detections)
+        aligned(models, (detections[:count], points[: 100 * count]))
+    assert "\n" not in str(caught.value)
+    with pytest.raises(AlignmentError, match=f"{count} of {count} instances found agree") as caught:
+        fitted(models, detections[:count], truth)
     assert "\n" not in str(caught.value)
 
 
 def test_many_alike_come_to_an_end() -> None:
     rng = np.random.default_rng(1)
-    models = design(rng, (BEAM, 300), (ODD, 3))
+    models = design(rng, (BEAM, 80), (ODD, 3))
     truth = anywhere(rng)
-    told = align(models, found(models, truth, rng, off=0.003, left_out=0.5))
+    told = aligned(models, found(models, truth, rng, off=0.003, left_out=0.5))
     assert np.abs(error(told, truth)).max() < 0.01
 
 
@@ -232,12 +271,13 @@ def inspected() -> scanfind.Findings:
     stations = np.array([[0.3, -3.5, 1.5], [-3.5, 1.5, 1.5], [3.8, 3.0, 1.6]])
     scans = [
         replace(each, xyz=SCENE_FROM_DESIGN.move(each.xyz), origin=SCENE_FROM_DESIGN.move(each.origin[None])[0])
-        for each in scan(Scene(tuple(built), stations), scanner=Scanner(step=0.002), seed=3).stations
+        for each in scan(Scene(tuple(built), stations), scanner=Scanner(step=0.003), seed=3).stations
         if each.origin is not None
     ]
     return scanfind.inspect(scans, replace(BRACKET, placements=PLACES))
 
 
+@pytest.mark.slow
 def test_a_scan_in_another_frame_is_aligned_and_inspected(inspected: scanfind.Findings) -> None:
     alignment = inspected.alignment
     assert alignment is not None
@@ -248,6 +288,7 @@ def test_a_scan_in_another_frame_is_aligned_and_inspected(inspected: scanfind.Fi
     assert [element.status for element in inspected.elements] == [INSTALLED] * 4
 
 
+@pytest.mark.slow
 def test_an_alignment_survives_the_result_folder_and_leads_back_into_the_design(
     inspected: scanfind.Findings, tmp_path: Path
 ) -> None:

@@ -1,8 +1,10 @@
 """Where a design lies in the frame of a scan, found from its elements themselves.
 
-Each instance found, taken for each place that the design has for its model, says where the design lies. Most of them
-are wrong: the right place is the one on which most instances agree. That they share is then fitted to all of them at
-once. A design that lies equally well in two ways, such as a symmetric building, is refused rather than guessed.
+Each instance found, taken for each place that the design has for its model, says where the design may lie. Most say
+wrong: of one steel section every piece looks like part of every longer one. So each is asked how much of the whole
+design would then lie on the scan, and the one that explains the most elements holds. A design that lies equally well
+in two ways, such as a symmetric building, is refused rather than guessed. What the elements then found in their places
+share is fitted to all of them at once.
 """
 
 from __future__ import annotations
@@ -21,22 +23,26 @@ from scanfind.pose import Pose, rotation_from_vector
 if TYPE_CHECKING:
     from scanfind.detection import Detection
     from scanfind.model import Model
+    from scanfind.thinned import Thinned
 
 Floats = NDArray[np.float64]
 
-# Elements agree that lie so near to their places, and are turned by less; beams that slid along themselves count.
-AGREE_M, AGREE_RAD = 0.1, np.radians(5.0)
-# Where one element says the design lies is off by what its own pose is off by, times how far away the others are.
-FIRST_M, FIRST_RAD = 0.3, np.radians(1.5)
-STEPS = 12  # of the fit, from there to AGREE_M; half as many at the end
-# Two elements agree by chance; of three, each could still be off by what the others are.
+CELL_M = 0.08  # of the thinned scan: a design that lies so well on it has its elements found in their places
+SAMPLES, FEW = 40, 8  # of an element's surface, evenly over it; to begin with
+ACROSS_M = 0.03  # from the design's surface: what lies flat on a floor has only its underside there
+EXPLAINED = 0.5  # of its samples on the scan: others may hide the rest
+GATES_M = np.geomspace(0.16, 0.08, 12)  # how far from the design the scan may be that it is drawn to, step by step
+# Two elements lie somewhere by chance; of three, each could still be off by what the others are.
 LEAST = 3
-# As much better as this (in elements, and as a share of those that agree) the best must be than the next.
-BETTER_BY, BETTER_SHARE = 3, 0.1
-HELD = 0.01  # see `refine.held`: of a motion fixed so many times as well as others on average half is believed
+# By so many elements, and by such a share of those it explains, the best must be better than the next.
+BETTER_BY, BETTER_SHARE = 2, 0.1
+WORTH = 0.6  # of what the best explains to begin with: what explains less comes no nearer to it than that
+MOST_CLAIMS, MOST_TRIED, REFINED = 10_000, 1_000, 12
 UPRIGHT = np.cos(np.radians(2.0))
-WORTH = 0.5  # of the votes of the best: what has fewer comes no nearer to it than BETTER_SHARE
-MOST_CLAIMS, MOST_TRIED, REFINED, BLOCK = 10_000, 1_000, 20, 1 << 20
+# Elements agree that lie so near to their places, and are turned by less; beams that slid along themselves count.
+FIRST_M, AGREE_M, AGREE_RAD = 0.3, 0.1, np.radians(5.0)
+STEPS = 12  # of the fit, from FIRST_M to AGREE_M; half as many at the end
+HELD = 0.01  # see `refine.held`: of a motion fixed so many times as well as others on average half is believed
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,48 +100,159 @@ class Claims(NamedTuple):
         )  # fmt: skip
 
 
-class Fit(NamedTuple):
-    """An alignment fitted to the claims that agree with it; see Alignment for what it says."""
+class Drawn(NamedTuple):
+    """The surface of a design: points and normals (S, 3), evenly over each element; of which element each is, (S,)."""
 
-    rotation: Floats
-    translation: Floats
-    agreeing: NDArray[np.intp]
-    covariance: Floats
-    pivot: Floats
-    rms: float
+    points: Floats
+    normals: Floats
+    element: NDArray[np.intp]
 
 
-def align(models: Sequence[Model], detections: Sequence[Detection], *, upright: bool = False) -> Alignment:
-    """Where the design lies in which some models have their placements, by instances of them found anywhere.
+class Lying(NamedTuple):
+    """A place of the design in the scan, and how many elements lie on the scan then."""
 
+    pose: Pose
+    explained: int
+
+
+def lies_at(models: Sequence[Model], detections: Sequence[Detection], scan: Thinned, *, upright: bool = False) -> Pose:
+    """scene_from_design, to a few centimetres, of a design whose models have their placements.
+
+    detections : instances of some of the models, found anywhere
     upright : up is the same in design and scan: what leans by more than 2° is not thought of
 
-    Raises AlignmentError, one line, where fewer than three elements agree, or two alignments explain as much.
+    Raises AlignmentError, one line, where fewer than three elements lie on the scan, or two ways explain as many.
     """
-    claims = claims_of(models, detections) if detections else None
-    fits = distinct([fit(claims, *start) for start in starts(claims, upright=upright)], claims) if claims else []
-    if not fits or len(fits[0].agreeing) < LEAST:
-        most = len(fits[0].agreeing) if fits else 0
+    found = lyings(models, detections, scan, upright=upright)
+    if not found or found[0].explained < LEAST:
         msg = (
-            f"the design cannot be aligned: of {len(detections)} instances found {most} agree on where it lies, and "
-            f"{LEAST} must: search longer, give more of the design, or bring the scan into its frame"
+            f"the design cannot be aligned: wherever the {len(detections)} instances found put it, at most "
+            f"{found[0].explained if found else 0} elements lie on the scan, and {LEAST} must: search longer, or bring "
+            "the scan into its frame"
         )
         raise AlignmentError(msg)
-    best = fits[0]
-    count = len(best.agreeing)
-    for rival in fits[1:]:
-        if count - len(rival.agreeing) < max(BETTER_BY, BETTER_SHARE * count):
-            angle, far = apart(best, rival)
+    best = found[0]
+    for rival in found[1:]:
+        if best.explained - rival.explained < max(BETTER_BY, BETTER_SHARE * best.explained):
+            _, angle = best.pose.difference(rival.pose)
             msg = (
-                f"the design can be aligned in two ways: {count} elements agree on one, {len(rival.agreeing)} on one "
-                f"turned by {np.degrees(angle):.0f}° and {far:.1f} m away: give a part of it that is not alike, or "
-                "bring the scan into its frame"
+                f"the design can be aligned in two ways: {best.explained} elements lie on the scan in one, "
+                f"{rival.explained} in one turned by {np.degrees(angle):.0f}° against it: give more of the design, "
+                "or bring the scan into its frame"
             )
             raise AlignmentError(msg)
-    x, y, z = best.pivot.tolist()
-    return Alignment(
-        Pose(best.rotation, best.translation), best.covariance, (x, y, z), count, len(detections), best.rms
-    )
+    return best.pose
+
+
+def lyings(models: Sequence[Model], detections: Sequence[Detection], scan: Thinned, *, upright: bool) -> list[Lying]:
+    """The places of the design that instances tell of, drawn onto the scan, those that explain most first."""
+    if not detections:
+        return []
+    claims, drawn = claims_of(models, detections), drawn_of(models)
+    first = np.arange(len(drawn.element)) % SAMPLES < FEW
+    few = Drawn(drawn.points[first], drawn.normals[first], drawn.element[first])
+    tried = np.arange(min(len(claims.found), MOST_TRIED))
+    if upright:
+        tried = tried[claims.rotation[tried, 2, 2] > UPRIGHT]
+    starts = [
+        Pose(rotation, seen - rotation @ place)
+        for rotation, seen, place in zip(claims.rotation[tried], claims.seen[tried], claims.drawn[tried], strict=True)
+    ]
+    counts = np.array([explained(few, scan, start) for start in starts], np.int64)
+    kept: list[Lying] = []
+    for k in np.argsort(-counts, kind="stable"):
+        if len(kept) == REFINED or counts[k] < WORTH * counts.max():
+            break
+        if not any(_near(starts[k], one.pose, drawn.points) for one in kept):
+            pose = settled(drawn, scan, starts[k])
+            kept.append(Lying(pose, explained(drawn, scan, pose, ACROSS_M)))
+    kept.sort(key=lambda one: -one.explained)
+    apart: list[Lying] = []
+    for one in kept:
+        if not any(_near(one.pose, other.pose, drawn.points) for other in apart):
+            apart.append(one)
+    return apart
+
+
+def drawn_of(models: Sequence[Model]) -> Drawn:
+    """The surface of all elements; SAMPLES of each, fewer of models that have no more."""
+    points, normals, element, number = [], [], [], 0
+    for model in models:
+        some = np.resize(np.arange(min(SAMPLES, len(model.samples))), SAMPLES)
+        for place in placements_of(model):
+            points.append(place.design_from_model.move(model.samples.points[some]))
+            normals.append(place.design_from_model.turn(model.samples.normals[some]))
+            element.append(np.full(SAMPLES, number))
+            number += 1
+    return Drawn(np.concatenate(points), np.concatenate(normals), np.concatenate(element))
+
+
+def explained(drawn: Drawn, scan: Thinned, pose: Pose, within: float = np.inf) -> int:
+    """How many elements lie on the scan, by half of their surface or more; `within` metres across that surface."""
+    at = pose.move(drawn.points)
+    distance, which = scan.nearest(at)
+    across = np.abs(np.einsum("si,si->s", scan.means[which] - at, pose.turn(drawn.normals)))
+    on = np.bincount(drawn.element, (distance < scan.cell) & (across < within))
+    return int((on >= EXPLAINED * np.bincount(drawn.element)).sum())
+
+
+def settled(drawn: Drawn, scan: Thinned, pose: Pose) -> Pose:
+    """A place of the design drawn onto the scan: ICP, point to the plane of the design, with Tukey's weights."""
+    for gate in GATES_M:
+        at, normals = pose.move(drawn.points), pose.turn(drawn.normals)
+        distance, which = scan.nearest(at)
+        near = distance < gate
+        if near.sum() < 6:
+            return pose
+        middle = at[near].mean(axis=0)
+        off = np.einsum("si,si->s", scan.means[which[near]] - at[near], normals[near])
+        weight = (1.0 - np.minimum(np.abs(off) / gate, 1.0) ** 2) ** 2
+        rows = np.concatenate([np.cross(at[near] - middle, normals[near]), normals[near]], axis=1)
+        step = np.linalg.lstsq((rows * weight[:, None]).T @ rows, (rows * weight[:, None]).T @ off, rcond=1e-9)[0]
+        turn = rotation_from_vector(step[:3])
+        pose = Pose(turn, middle - turn @ middle + step[3:]) @ pose
+    return pose
+
+
+def fitted(models: Sequence[Model], detections: Sequence[Detection], start: Pose) -> Alignment:
+    """The alignment that all instances which agree with it share, each of them and each place of the design once.
+
+    start : scene_from_design, to a few centimetres
+
+    Gauss–Newton on (rotation × radius, translation) of each instance, along what the scan fixes of it, with weights
+    that let those which are far off say little (Geman & McClure 1987). Raises AlignmentError for fewer than three.
+    """
+    rotation, translation = start.rotation, start.translation
+    claims = claims_of(models, detections) if detections else None
+    for gate in (*np.geomspace(FIRST_M, AGREE_M, STEPS), *[AGREE_M] * (STEPS // 2)):
+        off, agreeing = (np.empty(0), np.empty(0, np.intp))
+        if claims is not None:
+            off, agreeing = agreement(claims, rotation, translation, gate)
+        if claims is None or len(agreeing) < LEAST:
+            msg = (
+                f"the design cannot be aligned: {len(agreeing)} of {len(detections)} instances found agree on where it "
+                f"lies, and {LEAST} must: search longer, give more of the design, or bring the scan into its frame"
+            )
+            raise AlignmentError(msg)
+        some, residual = claims.take(agreeing), off[agreeing]
+        pivot = some.seen.mean(axis=0)
+        # Of each, per motion that the scan fixes.
+        motions = np.maximum(np.einsum("tii->t", some.fixed), 1e-9)
+        squared = np.einsum("ti,tij,tj->t", residual, some.fixed, residual) / motions
+        weight = 1.0 / (1.0 + squared / (20.0 * max(float(np.median(squared)), 1e-9))) ** 2
+        lever = jacobian(some, pivot)
+        information = np.einsum("t,tki,tkl,tlj->ij", weight, lever, some.fixed, lever)
+        values, vectors = np.linalg.eigh(information)
+        fixed = values > 1e-6 * values.max()
+        inverse = (vectors[:, fixed] / values[fixed]) @ vectors[:, fixed].T
+        step = inverse @ np.einsum("t,tki,tkl,tl->i", weight, lever, some.fixed, residual)
+        turn = rotation_from_vector(step[:3])
+        rotation, translation = turn @ rotation, turn @ (translation - pivot) + pivot + step[3:]
+        left = residual - np.einsum("tij,j->ti", lever, step)
+        total = float(weight @ np.einsum("ti,tij,tj->t", left, some.fixed, left))
+        rms = float(np.sqrt(total / max(weight @ motions - 6.0, 1.0)))
+    x, y, z = pivot.tolist()
+    return Alignment(Pose(rotation, translation), rms**2 * inverse, (x, y, z), len(agreeing), len(detections), rms)
 
 
 def claims_of(models: Sequence[Model], detections: Sequence[Detection]) -> Claims:
@@ -182,75 +299,6 @@ def believed(information: Floats) -> Floats:
     return np.asarray((motions * share) @ motions.T)
 
 
-def starts(claims: Claims, *, upright: bool) -> list[tuple[Floats, Floats]]:
-    """Where claims say the design lies, (3, 3) and (3,), those first with which most instances agree roughly."""
-    tried = np.arange(min(len(claims.found), MOST_TRIED))
-    if upright:
-        tried = tried[claims.rotation[tried, 2, 2] > UPRIGHT]
-    votes = np.zeros(len(tried), np.int64)
-    if not len(tried):
-        return []
-    # About their middles: far from zero the differences of what follows would lose their digits.
-    drawn, seen = claims.drawn - claims.drawn.mean(axis=0), claims.seen - claims.seen.mean(axis=0)
-    turns = claims.rotation.reshape(-1, 9)
-    first = np.flatnonzero(np.diff(claims.found, prepend=-1))  # claims of one instance lie side by side
-    step = max(1, BLOCK // len(claims.found))
-    for begin in range(0, len(tried), step):
-        some = tried[begin : begin + step]
-        # The angle between what two claims say is told by the trace of their quotient.
-        cosine = 0.5 * (turns[some] @ turns.T - 1.0)
-        moved = (drawn @ claims.rotation[some].transpose(0, 2, 1)) + (
-            seen[some] - np.einsum("aij,aj->ai", claims.rotation[some], drawn[some])
-        )[:, None]
-        gate = FIRST_M + FIRST_RAD * np.linalg.norm(seen[None] - seen[some, None], axis=2)
-        agree = (cosine > np.cos(AGREE_RAD)) & (np.linalg.norm(moved - seen, axis=2) < gate)
-        votes[begin : begin + step] = np.logical_or.reduceat(agree, first, axis=1).sum(axis=1)
-    found: list[tuple[Floats, Floats]] = []
-    for k in np.argsort(-votes, kind="stable"):
-        if len(found) == REFINED or votes[k] < max(LEAST, WORTH * votes.max()):
-            break
-        rotation = claims.rotation[tried[k]]
-        start = rotation, claims.seen[tried[k]] - rotation @ claims.drawn[tried[k]]
-        if not any(_near(start, other, claims.drawn) for other in found):
-            found.append(start)
-    return found
-
-
-def fit(claims: Claims, rotation: Floats, translation: Floats) -> Fit:
-    """The alignment near a start that all claims which agree with it share, each instance and each place once.
-
-    Gauss–Newton on (rotation × radius, translation) of each instance, along what the scan fixes of it, with weights
-    that let those which are far off say little (Geman & McClure 1987).
-    """
-    gates = np.concatenate([np.geomspace(FIRST_M * 2.0, AGREE_M, STEPS), np.full(STEPS // 2, AGREE_M)])
-    covariance, pivot, rms = np.zeros((6, 6)), translation, 0.0
-    for gate in gates:
-        off, agreeing = agreement(claims, rotation, translation, float(gate))
-        if len(agreeing) < LEAST:
-            break
-        some = claims.take(agreeing)
-        residual, pivot = off[agreeing], some.seen.mean(axis=0)
-        squared = np.einsum("ti,tij,tj->t", residual, some.fixed, residual)
-        directions = np.einsum("tii->t", some.fixed)
-        scale = max(float(np.median(squared / np.maximum(directions, 1e-9))), 1e-8) * 2.2
-        weight = 1.0 / (1.0 + squared / np.maximum(directions, 1e-9) / (9.0 * scale)) ** 2
-        lever = jacobian(some, pivot)
-        information = np.einsum("t,tki,tkl,tlj->ij", weight, lever, some.fixed, lever)
-        gradient = np.einsum("t,tki,tkl,tl->i", weight, lever, some.fixed, residual)
-        values, vectors = np.linalg.eigh(information)
-        fixed = values > 1e-6 * values.max()
-        inverse = (vectors[:, fixed] / values[fixed]) @ vectors[:, fixed].T
-        step = inverse @ gradient
-        turn = rotation_from_vector(step[:3])
-        rotation, translation = turn @ rotation, turn @ (translation - pivot) + pivot + step[3:]
-        left = residual - np.einsum("tij,j->ti", lever, step)
-        total = float(weight @ np.einsum("ti,tij,tj->t", left, some.fixed, left))
-        rms = float(np.sqrt(total / max(weight @ directions - 6.0, 1.0)))
-        covariance = rms**2 * inverse
-    _, agreeing = agreement(claims, rotation, translation, AGREE_M)
-    return Fit(rotation, translation, agreeing, covariance, pivot, rms)
-
-
 def agreement(claims: Claims, rotation: Floats, translation: Floats, gate: float) -> tuple[Floats, NDArray[np.intp]]:
     """How far claims are from an alignment, (T, 6), and which agree, best first: of each instance and place one."""
     quotient = claims.rotation @ rotation.T
@@ -286,24 +334,9 @@ def jacobian(claims: Claims, pivot: Floats) -> Floats:
     return found
 
 
-def distinct(fits: Sequence[Fit], claims: Claims) -> list[Fit]:
-    """The fits that are not one another's likes, those on which most agree first."""
-    kept: list[Fit] = []
-    for one in sorted(fits, key=lambda each: (-len(each.agreeing), each.rms)):
-        if not any(_near(one[:2], other[:2], claims.drawn) for other in kept):
-            kept.append(one)
-    return kept
-
-
-def apart(one: Fit, other: Fit) -> tuple[float, float]:
-    """By what angle, radians, and how far at the first's pivot, metres, two alignments differ."""
-    _, angle = Pose(one.rotation, one.translation).difference(Pose(other.rotation, other.translation))
-    drawn = one.rotation.T @ (one.pivot - one.translation)
-    return angle, float(np.linalg.norm(other.rotation @ drawn + other.translation - one.pivot))
-
-
-def _near(one: tuple[Floats, Floats], other: tuple[Floats, Floats], drawn: Floats) -> bool:
-    """Do two alignments put all points of a design (N, 3) to nearly the same places, and turn it nearly alike?"""
-    moved = drawn @ (one[0] - other[0]).T + (one[1] - other[1])
-    cosine = 0.5 * (float(np.sum(one[0] * other[0])) - 1.0)  # a line of joists turned about itself is in place, too
-    return cosine > np.cos(AGREE_RAD) and bool(np.linalg.norm(moved, axis=1).max() < 2.0 * FIRST_M)
+def _near(one: Pose, other: Pose, drawn: Floats) -> bool:
+    """Do two places put all points of a design (N, 3) to nearly the same spots, and turn it nearly alike?"""
+    # A line of joists turned about itself is in place, too.
+    _, angle = one.difference(other)
+    moved = np.linalg.norm(one.move(drawn) - other.move(drawn), axis=1)
+    return angle < AGREE_RAD and float(moved.max()) < FIRST_M

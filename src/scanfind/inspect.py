@@ -7,20 +7,24 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
-from scanfind.alignment import align
-from scanfind.elements import INSTALLED, placements_of
+from scanfind.alignment import CELL_M, fitted, lies_at
+from scanfind.elements import INSTALLED, installed, placements_of
 from scanfind.errors import AlignmentError
 from scanfind.find import find, models_of
+from scanfind.free_space import Spoken
 from scanfind.library import ModelLibrary
 from scanfind.parameters import PRESETS, Parameters
+from scanfind.sources import Sources
+from scanfind.thinned import Thinned
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from scanfind.alignment import Alignment
     from scanfind.detection import Findings
+    from scanfind.elements import Element
     from scanfind.find import ModelInput
     from scanfind.model import Model
+    from scanfind.pose import Pose
     from scanfind.progress import Progress
     from scanfind.sources import Scan
 
@@ -54,39 +58,55 @@ def inspect(
     parameters = parameters or PRESETS["default"]
     models = models_of(design, parameters, units, select)
 
-    def found(placed: Sequence[Model], *, at_design: bool) -> Findings:
+    def found(placed: Sequence[Model], *, at_design: bool, isolate: bool) -> Findings:
         with ExitStack() as stack:
             library = stack.enter_context(ModelLibrary.in_memory())
             for model in placed:
                 library.put(model)
             return find(
                 scans, library, parameters=parameters, seed=seed, jobs=jobs, origin=origin, progress=progress,
-                at_design=at_design,
+                at_design=at_design, isolate=isolate,
             )  # fmt: skip
 
-    before = found(models, at_design=align_by != "always")
+    before = found(models, at_design=align_by != "always", isolate=align_by != "always")
     in_place = any(element.status == INSTALLED for element in before.elements)
     if align_by == "never" or (align_by == "auto" and in_place):
         return before
+    sources = Sources(scans, origin)
     try:
-        alignment = align(models, before, upright=upright)
+        start = lies_at(models, before, Thinned((chunk.xyz for chunk in sources.chunks()), CELL_M), upright=upright)
+        placed = [moved(model, start) for model in models]
+        findings = found(placed, at_design=True, isolate=True)
+        alignment = fitted(models, findings, start)
     except AlignmentError as error:
         if align_by == "always":
             raise
         before.notes.append(f"nothing is where the design puts it, and {error}")
         return before
-    findings = found([moved(model, alignment) for model in models], at_design=True)
     findings.alignment = alignment
+    by_name = {model.name: model for model in models}
+    correction = alignment.scene_from_design @ start.inverse()
+    findings.elements = [retold(each, by_name[each.model], findings, correction) for each in findings.elements]
     for stage, seconds in before.timings_s.items():
         findings.timings_s[stage] = findings.timings_s.get(stage, 0.0) + seconds
     return findings
 
 
-def moved(model: Model, alignment: Alignment) -> Model:
-    """A model with its places where an alignment puts them in the scans."""
+def moved(model: Model, scene_from_design: Pose) -> Model:
+    """A model with its places where a motion puts them."""
     places = tuple(
-        replace(each, design_from_model=alignment.scene_from_design @ each.design_from_model)
-        for each in placements_of(model)
+        replace(each, design_from_model=scene_from_design @ each.design_from_model) for each in placements_of(model)
     )
     mesh = None if model.mesh is None else replace(model.mesh, placements=places)
     return replace(model, placements=places, mesh=mesh)
+
+
+def retold(element: Element, model: Model, findings: Findings, correction: Pose) -> Element:
+    """An element whose place in the design was moved, by millimetres: how far off it is from there."""
+    place = replace(element.placement, design_from_model=correction @ element.placement.design_from_model)
+    found = next((each for each in findings if each.id == element.detection), None)
+    if found is None:
+        return replace(element, placement=place)
+    shares = element.on, element.beside, element.through, element.hidden
+    spoken = None if None in shares else Spoken(*(share or 0.0 for share in shares))
+    return installed(model, place, found, spoken)

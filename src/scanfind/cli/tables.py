@@ -91,7 +91,7 @@ def alignment_in_words(alignment: AlignmentEntry) -> str:
     agree = f"{alignment.agreeing} of {alignment.found} instances found agree to {alignment.rms_m * 1e3:.1f} mm"
     sure = f"± {alignment.sigma_m * 1e3:.1f} mm and ± {degrees(alignment.sigma_rad):.3f}°"
     return (
-        f"scans and design are in different frames: the design's origin lies at {x:.3f} {y:.3f} {z:.3f} m in the scans, "
+        f"scans and design are in different frames: the design's origin is at {x:.3f} {y:.3f} {z:.3f} m in the scans, "
         f"turned by {angles} (yaw, pitch, roll); {agree}; known to {sure}"
     )
 
