@@ -46,7 +46,7 @@ def inspect(
     For example:
 
         scanfind inspect shop.e57 --design steel.ifc --allowed 0.01 --out inspected
-        scanfind inspect shop.e57 --design steel.ifc --align always --upright
+        scanfind inspect shop.e57 --design steel.ifc --upright
 
     Parameters
     ----------
