@@ -40,14 +40,14 @@ def inspect(
     units: str | None = None,
     select: Sequence[str] = (),
     progress: Progress | None = None,
-    align_by: Literal["auto", "always", "never"] = "auto",
+    align: Literal["auto", "always", "never"] = "auto",
     upright: bool = False,
 ) -> Findings:
     """Say of every element of a design what became of it: see `Findings.elements`.
 
         scans, parameters, seed, jobs, origin, units, select, progress : as for `find`
         design : models with their places, such as an IFC file, or models drawn where they should stand
-        align_by : find from the elements where the design lies in the scans: "always"; "never", they are in one frame;
+        align : find from the elements where the design lies in the scans: "always"; "never", they are in one frame;
             "auto": where nothing at all is in its place
         upright : up is the same in design and scans
 
@@ -68,9 +68,9 @@ def inspect(
                 at_design=at_design, isolate=isolate,
             )  # fmt: skip
 
-    before = found(models, at_design=align_by != "always", isolate=align_by != "always")
+    before = found(models, at_design=align != "always", isolate=align != "always")
     in_place = any(element.status == INSTALLED for element in before.elements)
-    if align_by == "never" or (align_by == "auto" and in_place):
+    if align == "never" or (align == "auto" and in_place):
         return before
     sources = Sources(scans, origin)
     try:
@@ -79,7 +79,7 @@ def inspect(
         findings = found(placed, at_design=True, isolate=True)
         alignment = fitted(models, findings, start)
     except AlignmentError as error:
-        if align_by == "always":
+        if align == "always":
             raise
         before.notes.append(f"nothing is where the design puts it, and {error}")
         return before

@@ -80,7 +80,7 @@ def description(results: Results, element: ElementEntry, judgement: str) -> str:
     if element.shift_m is not None:
         x, y, z = (1e3 * value for value in element.shift_m)
         turn = degrees(element.turn_rad or 0.0)
-        lines.append(f"Shift of its middle: x {x:+.1f}, y {y:+.1f}, z {z:+.1f} mm; turned by {turn:.2f}°.")
+        lines.append(f"Shift of its middle: x {x:+z.1f}, y {y:+z.1f}, z {z:+z.1f} mm; turned by {turn:.2f}°.")
     if judgement:
         lines.append(f"{judgement[:1].upper()}{judgement[1:]}.")
     elif results.allowed_m is not None and element.verdict is not None:

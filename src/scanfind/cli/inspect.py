@@ -113,7 +113,7 @@ def inspect(
         progress = stack.enter_context(progress_on())
         findings = inspect_scans(
             scans, models, parameters=parameters, seed=run.seed, jobs=run.jobs, origin=run.origin,
-            progress=progress, align_by=align, upright=upright,
+            progress=progress, align=align, upright=upright,
         )  # fmt: skip
         findings.allowed_m = allowed
         results = results_of(findings, folder, models, run, parameters, progress)
