@@ -53,11 +53,13 @@ def main(
     """
     meshes = [mesh for mesh in read_models(data / STEEL) if isinstance(mesh, Mesh) and "Kubus" not in mesh.name]
     rows = [row_of(seed, meshes, int(points), time_limit) for seed in seeds_of(seeds)]
+    error, told, angle, told_angle, squared = (
+        median([getattr(row, column) for row in rows])
+        for column in ("error_mm", "told_mm", "error_deg", "told_deg", "squared_over_told")
+    )
     lines = [
-        f"middle off by {median([row.error_mm for row in rows]):.2f} mm (median), "
-        f"told {median([row.told_mm for row in rows]):.2f} mm; turned by {median([row.error_deg for row in rows]):.4f}°, "
-        f"told {median([row.told_deg for row in rows]):.4f}°",
-        f"squared error over the covariance told, of which 6 is right: {median([r.squared_over_told for r in rows]):.1f}",
+        f"median: middle off by {error:.2f} mm, told {told:.2f}; turned by {angle:.4f}°, told {told_angle:.4f}",
+        f"squared error over the covariance told, of which 6 is right: {squared:.1f} (median)",
     ]
     tell(lines, write_csv("alignment", rows, seeds, date, lines))
 

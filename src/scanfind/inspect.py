@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
@@ -59,8 +58,7 @@ def inspect(
     models = models_of(design, parameters, units, select)
 
     def found(placed: Sequence[Model], *, at_design: bool, isolate: bool) -> Findings:
-        with ExitStack() as stack:
-            library = stack.enter_context(ModelLibrary.in_memory())
+        with ModelLibrary.in_memory() as library:
             for model in placed:
                 library.put(model)
             return find(
