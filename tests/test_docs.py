@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [README, *(page.read_text(encoding="utf-8") for page in sorted((ROOT / "docs").glob("*.md")))]
 COMMANDS = [
-    ("find",), ("inspect",), ("report",), ("isolate",), ("info",), ("library", "add"), ("library", "list"),
+    ("find",), ("inspect",), ("report",), ("bim",), ("isolate",), ("info",), ("library", "add"), ("library", "list"),
     ("library", "show"), ("library", "remove"), ("simulate",),
 ]  # fmt: skip
 # Enough for the examples to come to an end; how well they find is for other tests to say.
@@ -32,8 +32,12 @@ def _fences(language: str) -> list[str]:
     return [code for page in PAGES for code in fence.findall(page)]
 
 
+def _readme_lines(*programs: str) -> list[str]:
+    return [line for fence in _fences("sh") for line in fence.splitlines() if line.startswith(programs)]
+
+
 def _readme_commands() -> list[str]:
-    return [line for fence in _fences("sh") for line in fence.splitlines() if line.startswith("scanfind ")]
+    return _readme_lines("scanfind ")
 
 
 def _help(command: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> str:
@@ -114,11 +118,13 @@ def test_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:/usr/bin:/bin")
     monkeypatch.setenv(TIME_LIMIT, "5")
-    for line in _readme_commands():
+    for line in _readme_lines("scanfind ", "python examples/"):
         done = subprocess.run(["bash", "-c", _thinner(line)], cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 0, f"{line}\n{done.stderr}"
     assert (tmp_path / "found" / "results.json").is_file()
     assert (tmp_path / "results.json").is_file()
+    assert (tmp_path / "findings.bcf").is_file()
+    assert (tmp_path / "asbuilt.ifc").is_file()
     for code in _fences("python"):
         done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 0, f"{code}\n{done.stderr}"
@@ -150,6 +156,7 @@ def test_the_examples_of_every_help_run(
         "find",
         "inspect",
         "report",
+        "bim",
         "isolate",
         "info",
         "library remove",

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from scanfind.detection import Detection, Findings
     from scanfind.errors import ScanfindError
     from scanfind.find import find
+    from scanfind.inspect import inspect
     from scanfind.isolate import isolate
     from scanfind.library import ModelLibrary
     from scanfind.mesh import Mesh
@@ -48,6 +49,7 @@ __all__ = [
     "__version__",
     "find",
     "find_in_tiles",
+    "inspect",
     "isolate",
     "pose_error",
     "read_models",
@@ -67,6 +69,7 @@ _HOME = {
     "Parameters": "parameters",
     "find": "find",
     "find_in_tiles": "tiles",
+    "inspect": "inspect",
     "isolate": "isolate",
     "ModelLibrary": "library",
     "Mesh": "mesh",

@@ -63,6 +63,7 @@ def isolate_again(
             findings = Findings(with_points(found, surfaces, {}, chunks, within, rest, available_cores()))
         findings.refused, findings.notes = found.refused, found.notes
         findings.elements, findings.allowed_m = found.elements, found.allowed_m
+        findings.alignment = found.alignment
         findings.shift, findings.crs, findings.tolerance_m = found.shift, found.crs, within
         # Where the scanner stood may have been told to the search by hand.
         stood = {scan.path: scan.stations for scan in found.scans}

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scanfind.pose import Pose
 
 if TYPE_CHECKING:
+    from scanfind.alignment import Alignment
     from scanfind.elements import Element
 
 Floats = NDArray[np.float64]
@@ -183,6 +184,7 @@ class Findings(list[Detection]):
     elements : of the design, what became of each; empty where that was not asked for
     allowed_m : by how much an element may be off, metres; None: nobody says
     missing : scans that could not be read and were left out, and why
+    alignment : where the design lies in the scans, where that was found; None: they are in one frame
     """
 
     refused: list[Refused]
@@ -195,9 +197,10 @@ class Findings(list[Detection]):
     elements: list[Element]
     allowed_m: float | None
     missing: list[str]
+    alignment: Alignment | None
 
     def __init__(self, detections: list[Detection] | None = None) -> None:
         super().__init__(detections or [])
         self.refused, self.scans, self.notes, self.elements, self.missing = [], [], [], [], []
         self.shift, self.crs, self.timings_s, self.tolerance_m = (0.0, 0.0, 0.0), None, {}, None
-        self.allowed_m = None
+        self.allowed_m, self.alignment = None, None

@@ -6,6 +6,7 @@ import hashlib
 import os
 import sys
 from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
 from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic_core import to_jsonable_python
 
 from scanfind import schema
+from scanfind.alignment import Alignment
 from scanfind.clock import STAGES
 from scanfind.detection import Detection, Deviation, Findings, Motion, PartFit, Refused, SceneScan
 from scanfind.elements import Element
@@ -51,6 +53,7 @@ def document(
     return schema.Results(
         schema=schema.SCHEMA,
         scanfind=__version__,
+        made=datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
         seed=seed,
         parameters=to_jsonable_python(parameters),
         shift_m=findings.shift,
@@ -71,6 +74,7 @@ def document(
         refused=[_refused_entry(refused) for refused in findings.refused],
         elements=[_element_entry(element, findings.allowed_m) for element in findings.elements],
         allowed_m=findings.allowed_m,
+        alignment=None if findings.alignment is None else _alignment_entry(findings.alignment),
         remainder=remainder,
         notes=list(findings.notes),
         timings_s=timings,
@@ -83,6 +87,7 @@ def findings_of(results: schema.Results) -> Findings:
     findings = Findings([_detection(entry) for entry in results.detections])
     findings.refused = [_refused(entry) for entry in results.refused]
     findings.elements, findings.allowed_m = [_element(entry) for entry in results.elements], results.allowed_m
+    findings.alignment = None if results.alignment is None else _alignment(results.alignment)
     findings.scans = [SceneScan(scan.path, scan.points, scan.dropped, tuple(scan.stations_m)) for scan in results.scans]
     findings.shift, findings.crs, findings.notes = results.shift_m, results.crs, list(results.notes)
     findings.timings_s, findings.tolerance_m = dict(results.timings_s), results.tolerance_m
@@ -144,7 +149,7 @@ def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -
     return schema.DetectionEntry(
         id=found.id,
         model=found.model,
-        scene_from_model=_rows(found.scene_from_model),
+        scene_from_model=rows(found.scene_from_model),
         translation_m=_vector(found.scene_from_model.translation),
         quaternion=schema.Quaternion(**found.scene_from_model.quaternion()),
         score=_or_none(found.score),
@@ -172,7 +177,7 @@ def _part_entry(part: PartFit) -> schema.PartEntry:
         name=part.name,
         status=part.status,
         joined_to=part.joined_to,
-        built_from_design=_rows(part.built_from_design) if measured else None,
+        built_from_design=rows(part.built_from_design) if measured else None,
         shift_m=part.shift_m if measured else None,
         turn_rad=part.turn_rad if measured else None,
         off_m=_or_none(part.off_m),
@@ -207,7 +212,7 @@ def _deviation_entry(deviation: Deviation) -> schema.DeviationEntry:
 def _refused_entry(refused: Refused) -> schema.RefusedEntry:
     return schema.RefusedEntry(
         model=refused.model,
-        scene_from_model=_rows(refused.scene_from_model),
+        scene_from_model=rows(refused.scene_from_model),
         score=_or_none(refused.score),
         support=_or_none(refused.support),
         visible_support=_or_none(refused.visible_support),
@@ -226,7 +231,7 @@ def _element_entry(element: Element, allowed_m: float | None) -> schema.ElementE
         status=element.status,
         verdict=element.verdict(allowed_m),
         detection=element.detection,
-        design_from_model=_rows(placement.design_from_model),
+        design_from_model=rows(placement.design_from_model),
         shift_m=element.shift_m,
         turn_rad=element.turn_rad,
         off_m=element.off_m,
@@ -235,10 +240,25 @@ def _element_entry(element: Element, allowed_m: float | None) -> schema.ElementE
         through=element.through,
         hidden=element.hidden,
         why=element.why,
+        built_from_design=None if element.built_from_design is None else rows(element.built_from_design),
     )
 
 
-def _rows(pose: Pose) -> schema.Matrix:
+def _alignment_entry(alignment: Alignment) -> schema.AlignmentEntry:
+    return schema.AlignmentEntry(
+        scene_from_design=rows(alignment.scene_from_design),
+        covariance=_covariance(alignment.covariance),
+        pivot_m=alignment.pivot,
+        sigma_m=alignment.sigma_m,
+        sigma_rad=alignment.sigma_rad,
+        agreeing=alignment.agreeing,
+        found=alignment.found,
+        rms_m=alignment.rms_m,
+    )
+
+
+def rows(pose: Pose) -> schema.Matrix:
+    """A pose as results.json has it."""
     a, b, c, d = (tuple(row) for row in pose.matrix().tolist())
     return a, b, c, d
 
@@ -299,10 +319,16 @@ def _part(entry: schema.PartEntry) -> PartFit:
 
 def _element(entry: schema.ElementEntry) -> Element:
     placement = Placement(entry.global_id, entry.ifc_class, entry.name, _pose(entry.design_from_model))
+    moved = None if entry.built_from_design is None else _pose(entry.built_from_design)
     return Element(
         placement, entry.model, entry.status, entry.detection, entry.shift_m, entry.turn_rad, entry.off_m, entry.on,
-        entry.beside, entry.through, entry.hidden, entry.why,
+        entry.beside, entry.through, entry.hidden, entry.why, moved,
     )  # fmt: skip
+
+
+def _alignment(entry: schema.AlignmentEntry) -> Alignment:
+    pose, covariance = _pose(entry.scene_from_design), np.array(entry.covariance)
+    return Alignment(pose, covariance, entry.pivot_m, entry.agreeing, entry.found, entry.rms_m)
 
 
 def _refused(entry: schema.RefusedEntry) -> Refused:

@@ -55,6 +55,8 @@ class Element:
     on, beside, through, hidden : what beams say at the design's place, as shares of the surface they went to: they
         ended on it, near it but not on it, behind it, or before it. None where no scanner position is known
     why : the evidence in words
+    built_from_design : what moves it from its place in the design to where it stands, in the design's axes about their
+        origin; without the motions the scan hardly fixes. None unless installed
     """
 
     placement: Placement
@@ -69,6 +71,7 @@ class Element:
     through: float | None
     hidden: float | None
     why: str
+    built_from_design: Pose | None = None
 
     def verdict(self, allowed_m: float | None) -> str | None:
         """Is it where it should be to within so many metres? None where it was not found or nobody says how far."""
@@ -137,7 +140,8 @@ def installed(model: Model, placement: Placement, found: Detection, spoken: Spok
     further = off_by(model, model.samples.points, found.scene_from_model, design) - off
     if further > SAID_M:
         why += f"; {1e3 * further:.0f} mm more, along a motion the scan hardly fixes, are left out"
-    return Element(placement, model.name, INSTALLED, found.id, (x, y, z), turn, off, *shares(spoken), why)
+    moved = stands @ design.inverse()
+    return Element(placement, model.name, INSTALLED, found.id, (x, y, z), turn, off, *shares(spoken), why, moved)
 
 
 def drawn_back(model: Model, found: Detection, design: Pose) -> Pose:
@@ -147,13 +151,22 @@ def drawn_back(model: Model, found: Detection, design: Pose) -> Pose:
         return alike
     middle = found.scene_from_model.inverse().move(np.array(found.pivot)[None])
     radius = 0.5 * model.diameter
-    scale = np.array([radius] * 3 + [1.0] * 3)
-    information = np.asarray(
-        np.linalg.pinv(found.covariance * np.outer(scale, scale), rcond=1e-9, hermitian=True), np.float64
-    )
+    information = information_of(found, radius)
     # The pivot is in the middle of what was seen; a symmetry may have turned that elsewhere.
     there = alike.inverse().move(found.scene_from_model.move(middle))[0]
     return held(design, alike, information, there, radius)
+
+
+def information_of(found: Detection, radius: float) -> Floats:
+    """What the scan says of the motions (rotation × radius, translation of the pivot) of an instance, (6, 6), 1/m².
+
+    As if it said the same of all of them where there is no covariance; radius : of the model, metres.
+    """
+    if found.covariance is None:
+        return np.eye(6)
+    scale = np.array([radius] * 3 + [1.0] * 3)
+    inverse = np.linalg.pinv(found.covariance * np.outer(scale, scale), rcond=1e-9, hermitian=True)
+    return np.asarray(inverse, np.float64)
 
 
 def missed(model: Model, placement: Placement, spoken: Spoken | None) -> Element:

@@ -38,6 +38,10 @@ class MissingExtraError(ScanfindError):
     """An optional library is not installed; the message names the `pip install` that brings it."""
 
 
+class AlignmentError(ScanfindError):
+    """Where the design lies in the frame of the scans cannot be told, or in two ways equally well."""
+
+
 class LibraryError(ScanfindError):
     """A model library that is damaged, of another version, locked, or lacks the model asked for."""
 

@@ -99,8 +99,8 @@ def polished(found: Detection, near: NearSurface, parameters: RefineParameters, 
     fit = polish(near, found.scene_from_model, cut.xyz, cut.scan_id, parameters, jobs)
     if fit is None:
         return found
-    distance, _ = measured(near, fit.scene_from_model, cut.xyz, jobs)
-    # The few that are out of reach by a tenth of a millimetre now keep the distance they were isolated by.
+    # A few are farther now, by a tenth of a millimetre, than they were cut out to: they are still measured.
+    distance, _ = measured(near._replace(reach=2.0 * near.reach), fit.scene_from_model, cut.xyz, jobs)
     off = np.where(np.isnan(distance), cut.deviation, distance)
     return replace(
         found, scene_from_model=fit.scene_from_model, covariance=fit.covariance, pivot=triple(fit.pivot),

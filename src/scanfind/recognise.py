@@ -158,7 +158,9 @@ class Recognition:
             found = np.isin(np.arange(len(self.models)), [candidate.model for candidate in self.believed])
             self._lines = LineSearch(self.scene, self.models, ~found, self.parameters.search, self._seed, self.jobs)
             if self._lines:
-                return self._lines.round()
+                # What was refused for telling too little may be told by its lines.
+                again = [self._placements(c.model, [Pose(c.rotation, c.translation)]) for c, _ in self._refused]
+                return joined([*again, self._lines.round()])
         return self.search.round()
 
     def at_design(self) -> Iterator[Hypotheses]:

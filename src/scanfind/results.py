@@ -66,6 +66,29 @@ def result_folder(out: str | Path, *, overwrite: bool = False, kind: Kind | None
         shutil.rmtree(staged, ignore_errors=True)
 
 
+@contextmanager
+def result_file(out: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
+    """A file to write beside `out`, which takes the name `out` when the block ends well and goes when it does not.
+
+    Raises OutputError where something is there already, unless `overwrite` (of a file), or it cannot be written.
+    """
+    target = Path(out).absolute()
+    if target.is_dir() or (target.exists() and not overwrite):
+        what = "is a folder: name a file" if target.is_dir() else "is there already: name another or pass --overwrite"
+        msg = f"{out}: {what}"
+        raise OutputError(msg)
+    staged = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        yield staged
+        staged.replace(target)
+    except OSError as error:
+        msg = f"{out}: cannot be written: {error.strerror or error}: choose another place or make room"
+        raise OutputError(msg) from error
+    finally:
+        staged.unlink(missing_ok=True)
+
+
 def check_free(target: Path, *, overwrite: bool, kind: Kind | None = None) -> None:
     """Raise OutputError unless a folder of this kind (None: a result) may take this place."""
     kind = kind or Kind(RESULTS_JSON, lambda folder: _files_of(read_results(folder)))

@@ -178,12 +178,16 @@ class RefusedEntry(Entry):
 class ElementEntry(Entry):
     """An element of the design: what became of it, and the evidence that decided it.
 
+    `design_from_model`: where the design puts it, in the scan's frame (moved there by `alignment`, where there is one).
+
     `status`: installed, uncertain, occluded, not_found, not_enough_data or no_data. `verdict`: in_tolerance or
     out_of_tolerance, null where it was not found or no `allowed_m` was given. `detection`: the id of the instance taken
     for it. `shift_m` of its middle, in the scan's axes, `turn_rad` by what angle it is turned, `off_m` how far the
     point of its surface that moved the most did; all null where it was not found. `on`, `beside`, `through`, `hidden`:
     what beams say at the design's place, as shares of the surface they went to: they ended on it, near it but not on
-    it, behind it, before it; null where no scanner position is known.
+    it, behind it, before it; null where no scanner position is known. `built_from_design` moves it from its place in
+    the design to where it stands, without the motions the scan hardly fixes: null unless it is installed, and in
+    results of an earlier version.
     """
 
     global_id: str
@@ -202,18 +206,39 @@ class ElementEntry(Entry):
     through: float | None
     hidden: float | None
     why: str
+    built_from_design: Matrix | None = None
+
+
+class AlignmentEntry(Entry):
+    """Where the design lies in the scan's frame, found from its elements: all of them are where it puts them.
+
+    `covariance`, `pivot_m`, `sigma_m`, `sigma_rad`: of `scene_from_design`, as of a detection; `agreeing` of `found`
+    instances lie where it says, and are off from there by `rms_m`, root mean square of one coordinate.
+    """
+
+    scene_from_design: Matrix
+    covariance: Covariance
+    pivot_m: Vector
+    sigma_m: float
+    sigma_rad: float
+    agreeing: int
+    found: int
+    rms_m: float
 
 
 class Results(Entry):
     """results.json. `shift_m` was taken off while computing; every coordinate here has it added back.
 
     `tolerance_m` is within which points were isolated, null where they were not. `elements` are those of the design,
-    where a search was asked what became of it; `allowed_m` by how much they may be off.
+    where a search was asked what became of it; `allowed_m` by how much they may be off. `made`: when this was written,
+    UTC as in 2026-11-22T17:30:00Z, null in results of an earlier version. `alignment`: null where scans and design are
+    in one frame.
     """
 
     schema_: int = Field(SCHEMA, alias="schema")
     scanfind: str
     seed: int
+    made: str | None = None
     parameters: dict[str, Any]
     shift_m: Vector
     crs: str | None
@@ -224,6 +249,7 @@ class Results(Entry):
     refused: list[RefusedEntry]
     elements: list[ElementEntry] = []
     allowed_m: float | None = None
+    alignment: AlignmentEntry | None = None
     remainder: str | None = None
     notes: list[str] = []
     timings_s: dict[str, float]

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 from cyclopts import App, CycloptsError, MissingArgumentError
 
+from scanfind.cli.bim import bim
 from scanfind.cli.find import find
 from scanfind.cli.info import info
 from scanfind.cli.inspect import inspect
@@ -39,6 +40,7 @@ def _version() -> str:
 app = App(name="scanfind", help=HELP, version=_version, help_format="plaintext", suppress_keyboard_interrupt=False)
 app.command(find, usage="scanfind find SCAN... (--model FILE... | --library LIB) [OPTIONS]")
 app.command(inspect, usage="scanfind inspect SCAN... --design FILE... [OPTIONS]")
+app.command(bim, usage="scanfind bim RESULT_DIR [--bcf FILE] [--ifc FILE --design FILE] [OPTIONS]")
 app.command(library)
 app.command(isolate, usage="scanfind isolate RESULT_DIR SCAN... [OPTIONS]")
 app.command(report, usage="scanfind report RESULT_DIR [--out FILE...] [--tolerance PROFILE] [OPTIONS]")

@@ -34,15 +34,19 @@ def inspect(
     jobs: Count | None = None,
     tolerance: Metres | None = None,
     time_limit: Seconds | None = None,
+    align: Literal["auto", "always", "never"] = "auto",
+    upright: Flag = False,
     fail_on: Literal["not-found", "out-of-tolerance"] | None = None,
 ) -> int:
     """Say what became of every element of a design: is it there, and how far from where it should be?
 
-    The scans are in the design's frame. Each element is looked for where the design puts it, then anywhere.
+    Each element is looked for where the design puts it, then anywhere. Where nothing is in its place, scans and design
+    may be in different frames: where the design lies in the scans is then found from the elements themselves.
 
     For example:
 
         scanfind inspect shop.e57 --design steel.ifc --allowed 0.01 --out inspected
+        scanfind inspect shop.e57 --design steel.ifc --upright
 
     Parameters
     ----------
@@ -76,6 +80,10 @@ def inspect(
         Points this near to a found element are its own, metres.
     time_limit
         Look for elements that are not in their place no longer than this, seconds.
+    align
+        Find where the design lies in the scans: auto, where nothing is in its place; always; never.
+    upright
+        Up is the same in the scans and the design: no other way to align them is thought of.
     fail_on
         Exit with 3 if some element was not found, or is not found or out of tolerance.
 
@@ -89,7 +97,7 @@ def inspect(
 
     from scanfind.cli.inputs import open_models
     from scanfind.config import load_settings
-    from scanfind.find import find
+    from scanfind.inspect import inspect as inspect_scans
     from scanfind.parameters import PRESETS
     from scanfind.progress import progress_on
     from scanfind.results import result_folder
@@ -103,9 +111,9 @@ def inspect(
         folder = None if out is None else stack.enter_context(result_folder(out, overwrite=overwrite))
         models = stack.enter_context(open_models(design, None, run, parameters))
         progress = stack.enter_context(progress_on())
-        findings = find(
+        findings = inspect_scans(
             scans, models, parameters=parameters, seed=run.seed, jobs=run.jobs, origin=run.origin,
-            progress=progress, at_design=True,
+            progress=progress, align=align, upright=upright,
         )  # fmt: skip
         findings.allowed_m = allowed
         results = results_of(findings, folder, models, run, parameters, progress)
@@ -115,9 +123,11 @@ def inspect(
 
 def report(results: Results, out: Path | None, *, json: bool) -> None:
     """The table (or results.json) on stdout; on stderr the sum of it and where it lies."""
-    from scanfind.cli.tables import elements_in_words, elements_table
+    from scanfind.cli.tables import alignment_in_words, elements_in_words, elements_table
 
     say(results.to_json() if json else elements_table(results))
+    if results.alignment is not None:
+        note(alignment_in_words(results.alignment))
     for remark in results.notes:
         note(remark)
     points = sum(scan.points for scan in results.scans)

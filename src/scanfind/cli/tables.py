@@ -20,7 +20,7 @@ from scanfind.elements import (
 )
 
 if TYPE_CHECKING:
-    from scanfind.schema import DetectionEntry, ElementEntry, Matrix, PartEntry, RefusedEntry, Results
+    from scanfind.schema import AlignmentEntry, DetectionEntry, ElementEntry, Matrix, PartEntry, RefusedEntry, Results
     from scanfind.simulate import Sight
 
 FOUND = (
@@ -82,6 +82,18 @@ def elements_in_words(results: Results) -> str:
         off = sum(each.verdict == OUT_OF_TOLERANCE for each in results.elements)
         told.append(f"{off} out of tolerance ({results.allowed_m * 1e3:g} mm)")
     return f"{len(results.elements)} elements of the design: {', '.join(told)}"
+
+
+def alignment_in_words(alignment: AlignmentEntry) -> str:
+    """Where the design lies in the scans and how sure that is, in one line."""
+    x, y, z = (row[3] for row in alignment.scene_from_design[:3])
+    angles = " ".join(f"{angle:.3f}°" for angle in turned(alignment.scene_from_design))
+    agree = f"{alignment.agreeing} of {alignment.found} instances found agree to {alignment.rms_m * 1e3:.1f} mm"
+    sure = f"± {alignment.sigma_m * 1e3:.1f} mm and ± {degrees(alignment.sigma_rad):.3f}°"
+    return (
+        f"scans and design are in different frames: the design's origin is at {x:.3f} {y:.3f} {z:.3f} m in the scans, "
+        f"turned by {angles} (yaw, pitch, roll); {agree}; known to {sure}"
+    )
 
 
 def sight_table(sights: Sequence[Sight]) -> str:

@@ -1,0 +1,1 @@
+"""What was found, back into the BIM: issues as BCF, and a copy of the design that says what was built."""
