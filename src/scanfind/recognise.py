@@ -65,6 +65,7 @@ DRAWN_IN_CELLS = (2.0, 0.75)  # of the largest: how far off its design an elemen
 FARTHER_IF = 1.2  # … where so many more of its samples meet the scan there than about the design
 IN_PLACE_M = 0.06  # what ICP carried no farther off is still where the design puts it
 ON_BEAMS_CELLS, ON_BEAMS_STEPS = 1.5, 2  # how near the surface beams end that a pose is fitted to, and how often
+TOLD_BY_LINES = 12  # poses that these speak for, refined whatever the coarse surfels say
 REFUSED_SHOWN = 3  # of each model: what came closest
 
 
@@ -256,6 +257,11 @@ class Recognition:
         for model in np.unique(hypotheses.models):
             theirs = np.flatnonzero(hypotheses.models == model)
             kept[theirs[np.argsort(-scores[theirs], kind="stable")[:shown]]] = True
+        if self._lines:
+            # A pose on lines is half a cell off until it is fitted to beams, and looks worse than it is.
+            told = self._lines.beyond_chance(hypotheses)
+            best = np.argsort(-told, kind="stable")[:TOLD_BY_LINES]
+            kept[best[told[best] > 0.0]] = True
         return np.flatnonzero(kept)
 
     def _far_from(self, hypotheses: Hypotheses, met: Hypotheses) -> NDArray[np.intp]:
