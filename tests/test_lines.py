@@ -186,3 +186,12 @@ def test_a_frame_without_normals_is_found_by_its_lines_only() -> None:
     middle = np.array(FRAME_SIZE_M) / 2.0
     assert np.linalg.norm(found[0].scene_from_model.move(middle[None]) - TRUTH.move(middle[None])) < 0.01
     assert not find(hall, box_frame(), parameters=WITHOUT, isolate=False)
+
+
+def test_three_hundred_points_of_a_frame_and_nothing_else_are_enough() -> None:
+    far = blocks("far", [((30.0, 30.0, -0.1), (30.1, 30.1, 0.0))])
+    things = (SceneObject("far", far, Pose.identity()), SceneObject("frame", box_frame(), TRUTH, target=True))
+    alone = scan(SimulatedScene(things, np.array(STATIONS)), scanner=Scanner(), seed=3, points=300)
+    found = find(alone.stations, box_frame(), isolate=False)
+    assert len(found) == 1
+    assert np.linalg.norm(found[0].scene_from_model.translation - TRUTH.translation) < 0.005

@@ -149,13 +149,15 @@ class Recognition:
         if enough:
             return False
         # With nothing to show, rather a longer search than an answer that the next seed contradicts.
-        return not self.search.may_stop() or (not self.believed and self.search.look_deeper())
+        untried = self.parameters.search.by_lines and self._lines is None
+        return not self.search.may_stop() or (not self.believed and (untried or self.search.look_deeper()))
 
     def round(self) -> Hypotheses:
         """Hypotheses of one more round, best first: of pairs of surface; once, for models of which the first round of
         these found nothing, of lines.
         """
-        if self.parameters.search.by_lines and self._lines is None and self.search.rounds:
+        over = self.search.rounds > 0 or not self.search.pool_left()
+        if self.parameters.search.by_lines and self._lines is None and over:
             found = np.isin(np.arange(len(self.models)), [candidate.model for candidate in self.believed])
             self._lines = LineSearch(self.scene, self.models, ~found, self.parameters.search, self._seed, self.jobs)
             if self._lines:
@@ -204,7 +206,7 @@ class Recognition:
         better = met.take(np.argsort(-np.concatenate([r.matched for r in rough]), kind="stable"))
         better = better.take(distinct(better, self.arrays, self._apart_after, kept, 2 * kept))
         fine = self._icp_fine(better.take(self._promising(better, REFUSED_SHOWN)))
-        if self._lines:
+        if self._lines and self.parameters.refine.raw_steps:
             fine = self._on_beams(fine, self._lines.beyond_chance(fine.hypotheses) > 0.0)
         fine = fine.take(np.argsort(-fine.matched, kind="stable"))
         # What ended at one place is asked once.
