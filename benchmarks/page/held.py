@@ -199,10 +199,3 @@ def name(group: Sequence[Row]) -> str:
 
 def _told(value: float, unit: str, held: bool) -> tuple[str, bool | None]:
     return ("not measured", None) if math.isnan(value) else (f"{value:.2f} {unit}", held)
-
-
-def _span(ratios: Sequence[float]) -> str:
-    """Of which rows, in words."""
-    if not ratios:
-        return ""
-    return f" at {ratios[0]:g}" + (f" to {ratios[-1]:g}" if len(ratios) > 1 else "")

@@ -110,9 +110,10 @@ def origin(results: Results) -> str:
 def held(results: Results) -> str:
     """The targets."""
     said = {True: "held", False: "**NOT held**", None: "–"}
-    rows = [[one.what, one.limit, one.measured, said[one.held]] for one in claims(results)]
+    every = claims(results)
+    rows = [[one.what, one.limit, one.measured, said[one.held]] for one in every]
     told = "## What scanfind is held to\n\n" + table(["", "target", "measured", ""], rows)
-    missed = [one.what for one in claims(results) if one.held is False]
+    missed = [one.what for one in every if one.held is False]
     reasons = [f"- {what}: {why}" for what, why in WHY.items() if any(one.startswith(what) for one in missed)]
     return told + "\nWhy targets are missed:\n\n" + "\n".join(reasons) + "\n" if reasons else told
 

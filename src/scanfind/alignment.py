@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scanfind.elements import information_of, placements_of
 from scanfind.errors import AlignmentError
 from scanfind.pose import Pose, rotation_from_vector
+from scanfind.refine import believed
 
 if TYPE_CHECKING:
     from scanfind.detection import Detection
@@ -42,7 +43,6 @@ UPRIGHT = np.cos(np.radians(2.0))
 # Elements agree that lie so near to their places, and are turned by less; beams that slid along themselves count.
 FIRST_M, AGREE_M, AGREE_RAD = 0.3, 0.1, np.radians(5.0)
 STEPS = 12  # of the fit, from FIRST_M to AGREE_M; half as many at the end
-HELD = 0.01  # see `refine.held`: of a motion fixed so many times as well as others on average half is believed
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,14 +289,6 @@ def claims_of(models: Sequence[Model], detections: Sequence[Detection]) -> Claim
         np.array(found_), np.array(place_), np.array(rotation), np.array(seens), np.array(drawn), np.array(radii),
         np.array(fixed_),
     )  # fmt: skip
-
-
-def believed(information: Floats) -> Floats:
-    """Which motions (6, 6) data fix, 1 for well, 0 for not at all: as `refine.held` believes them."""
-    values, motions = np.linalg.eigh(information)
-    level = HELD * values.mean()
-    share = values**2 / (values**2 + level**2) if level > 0.0 else np.zeros(6)
-    return np.asarray((motions * share) @ motions.T)
 
 
 def agreement(claims: Claims, rotation: Floats, translation: Floats, gate: float) -> tuple[Floats, NDArray[np.intp]]:

@@ -164,27 +164,28 @@ class _Window:
 
 def level_of(model: Model, cell: float) -> int | None:
     """The lowest level above cells of this edge, metres, in whose windows enough of a model is lines; None: nowhere."""
-    from scanfind.kernels.lines import lines_of_samples
-
     most = int(np.floor(log2(max(LARGEST_WINDOW * model.diameter / (REACH * cell), 0.5))))
-    lines = np.empty((min(len(model.samples), SHAPED), 7))
     for level in range(most + 1):
-        # The first ones lie as evenly over the model as all of them.
-        lines_of_samples(model.samples.points, REACH * cell * 2.0**level, len(lines), lines)
-        if (lines[:, 6] > LINEAR).mean() >= LEAST_SHARE:
+        if (fitted_to(model, REACH * cell * 2.0**level, SHAPED)[:, 6] > LINEAR).mean() >= LEAST_SHARE:
             return level
     return None
 
 
 def model_as_lines(model: Model, reach: float) -> Model:
     """A model of which samples and pairs are lines, in windows of radius `reach`, metres."""
-    from scanfind.kernels.lines import lines_of_samples
-
-    fitted = np.empty((min(len(model.samples), LINES), 7))
-    lines_of_samples(model.samples.points, reach, len(fitted), fitted)
-    lines = _lines(fitted)
+    lines = _lines(fitted_to(model, reach, LINES))
     pairs = build_pairs(lines, model.diameter, model.spacing, model.parameters.pairs)
     return replace(model, samples=lines, pairs=pairs, signed=False)
+
+
+def fitted_to(model: Model, reach: float, most: int) -> Floats:
+    """The line about each of a model's first samples, at most so many: see kernels.lines.lines_of_samples."""
+    from scanfind.kernels.lines import lines_of_samples
+
+    # The first ones lie as evenly over the model as all of them.
+    fitted = np.empty((min(len(model.samples), most), 7))
+    lines_of_samples(model.samples.points, reach, len(fitted), fitted)
+    return fitted
 
 
 def lines_of_scene(grid: MomentGrid, level: int, jobs: int) -> OrientedCloud:

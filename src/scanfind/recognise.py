@@ -149,15 +149,17 @@ class Recognition:
         if enough:
             return False
         # With nothing to show, rather a longer search than an answer that the next seed contradicts.
-        untried = self.parameters.search.by_lines and self._lines is None
-        return not self.search.may_stop() or (not self.believed and (untried or self.search.look_deeper()))
+        return not self.search.may_stop() or (not self.believed and (self._untried() or self.search.look_deeper()))
+
+    def _untried(self) -> bool:
+        """Are lines still to be asked?"""
+        return self.parameters.search.by_lines and self._lines is None
 
     def round(self) -> Hypotheses:
         """Hypotheses of one more round, best first: of pairs of surface; once, for models of which the first round of
         these found nothing, of lines.
         """
-        over = self.search.rounds > 0 or not self.search.pool_left()
-        if self.parameters.search.by_lines and self._lines is None and over:
+        if self._untried() and (self.search.rounds or not self.search.pool_left()):
             found = np.isin(np.arange(len(self.models)), [candidate.model for candidate in self.believed])
             self._lines = LineSearch(self.scene, self.models, ~found, self.parameters.search, self._seed, self.jobs)
             if self._lines:

@@ -102,8 +102,7 @@ def shrinking(first_last: tuple[float, float], steps: int, cell: float) -> Float
 def held(design: Pose, found: Pose, information: Floats, middle: Floats, radius: float) -> Pose:
     """A pose drawn back to the design's along the motions that the data hardly fix, as far as they do not.
 
-    A beam slides along itself to where its neighbours' surfaces begin, and nearly nothing says it should not: of a
-    motion that the data fix HELD times as well as others on average half is believed, of one fixed less hardly any.
+    A beam slides along itself to where its neighbours' surfaces begin, and nearly nothing says it should not.
 
     information : (6, 6), any unit, of rotation × radius and translation of the middle, scene axes
     middle : (3,) of the model, its own frame; radius : metres
@@ -112,11 +111,20 @@ def held(design: Pose, found: Pose, information: Floats, middle: Floats, radius:
         return design
     at, there = design.move(middle[None])[0], found.move(middle[None])[0]
     turn = rotation_vector(found.rotation @ design.rotation.T) * radius
-    values, motions = np.linalg.eigh(information)
-    believed = values**2 / (values**2 + (HELD * values.mean()) ** 2)
-    kept = motions @ (believed * (motions.T @ np.concatenate([turn, there - at])))
+    kept = believed(information) @ np.concatenate([turn, there - at])
     rotation = rotation_from_vector(kept[:3] / radius) @ design.rotation
     return Pose(rotation, at + kept[3:] - rotation @ middle)
+
+
+def believed(information: Floats) -> Floats:
+    """How far motions (6,) are believed that data fix by `information` (6, 6): a matrix to move them by, (6, 6).
+
+    Of a motion fixed HELD times as well as others on average half is believed, of one fixed less hardly any.
+    """
+    values, motions = np.linalg.eigh(information)
+    level = HELD * values.mean()
+    share = values**2 / (values**2 + level**2) if level > 0.0 else np.zeros(6)
+    return np.asarray((motions * share) @ motions.T)
 
 
 def covariance_of(hessian: Floats, rms: float, radius: float, below: float) -> Floats:

@@ -53,6 +53,11 @@ class Tile(NamedTuple):
         """Which of some bins (K, 3) are in it."""
         return np.asarray(((bins >= self.low) & (bins < self.high)).all(axis=1))
 
+    def has(self, point: Floats, bin_m: float, rim: float = 0.0) -> bool:
+        """Is a point (3,), metres from the grid's offset, in it or in a rim of so many metres around it?"""
+        low, high = self.metres(bin_m)
+        return bool(((point >= low - rim) & (point < high + rim)).all())
+
     def metres(self, bin_m: float) -> Floats:
         """Its low and high corner, (2, 3), from the grid's offset."""
         return np.array([self.low, self.high]) * bin_m

@@ -180,9 +180,7 @@ def search(
 
     def near(one: Detection | Refused) -> bool:
         middle = one.scene_from_model.move(middles[one.model][None])[0] - job.offset
-        low, high = tile.metres(job.bin_m())
-        rim = RIM * diameters[one.model]
-        return bool(((middle >= low - rim) & (middle < high + rim)).all())
+        return tile.has(middle, job.bin_m(), RIM * diameters[one.model])
 
     return Searched(
         [one for one in found.detections() if near(one)], [one for one in found.refused() if near(one)], found.notes(),
@@ -232,7 +230,7 @@ def own(searched: Mapping[Tile, Searched], job: Job) -> list[Detection]:
     Of two tiles that tell the same instance the one in whose half-open box its middle lies is believed.
     """
     every = [(tile, one) for tile, found in sorted(searched.items()) for one in found.detections]
-    mine = {id(one): _inside(tile, one, job) for tile, one in every}
+    mine = {id(one): tile.has(np.array(one.pivot) - job.offset, job.bin_m()) for tile, one in every}
     diameters = {model.name: model.diameter for model in job.models()}
     kept: list[tuple[Tile, Detection]] = []
     for tile, one in sorted(every, key=lambda pair: not mine[id(pair[1])]):
@@ -244,12 +242,6 @@ def own(searched: Mapping[Tile, Searched], job: Job) -> list[Detection]:
             kept.append((tile, one))
     order = {id(one): place for place, (_, one) in enumerate(every)}
     return sorted((one for _, one in kept), key=lambda one: order[id(one)])
-
-
-def _inside(tile: Tile, one: Detection, job: Job) -> bool:
-    low, high = tile.metres(job.bin_m())
-    middle = np.array(one.pivot) - job.offset
-    return bool(((middle >= low) & (middle < high)).all())
 
 
 def cut(folder: Path, job: Job, scan: Scan, number: int, found: Sequence[Found], tolerance: float, first: int) -> Cut:
