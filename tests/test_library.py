@@ -112,6 +112,7 @@ def models(draw: st.DrawFn) -> Model:
         source=source,
         diameter=draw(floats),
         spacing=draw(floats),
+        area=draw(floats),
         signed=signed,
         samples=OrientedCloud(draw(rows(n, 3)), draw(rows(n, 3)), signed),
         mesh=mesh,
@@ -288,7 +289,7 @@ def never_ending_view(path: Path) -> None:
         (lambda path: path.write_bytes(b"solid box\n" * 1000), "is not a model library"),
         (lambda path: path.write_bytes(b"SQLite format 3\0" + bytes(5000)), "is (not a model library|damaged)"),
         (other_application, "is not a model library"),
-        (other_version, "has version 99, this scanfind reads 2"),
+        (other_version, "has version 99, this scanfind reads 3"),
         (never_ending_view, "is damaged"),
     ],
 )

@@ -58,4 +58,5 @@ def sample_cloud(cloud: CloudModel, parameters: SurfaceParameters, seed: int = 0
     points, normals = surface.points[shuffled], surface.normals[shuffled]
     reach = float(np.linalg.norm(np.ptp(points, axis=0)))
     order, spacing = poisson_order(points, normals, parameters.samples, reach / 2.0, SHRINK, MAX_LEVELS)
-    return surface_of(OrientedCloud(points[order], normals[order], surface.signed), spacing, len(surface) * AREA_OF_A_CELL * cell**2)
+    area = len(surface) * AREA_OF_A_CELL * cell**2
+    return surface_of(OrientedCloud(points[order], normals[order], surface.signed), spacing, area)
