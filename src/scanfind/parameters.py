@@ -11,6 +11,7 @@ from scanfind.fit.refine import RefineParameters
 from scanfind.grid.scene import GridParameters
 from scanfind.library.pairs import PairParameters
 from scanfind.library.surface import SurfaceParameters
+from scanfind.priors import Priors
 from scanfind.search.surface import SearchParameters
 
 
@@ -34,7 +35,7 @@ class IsolationParameters:
 
 @dataclass(frozen=True)
 class Parameters:
-    """Every parameter of the method, by stage."""
+    """Every parameter of the method, by stage; and what is known of the scene beforehand."""
 
     surface: SurfaceParameters = field(default_factory=SurfaceParameters)
     pairs: PairParameters = field(default_factory=PairParameters)
@@ -44,6 +45,7 @@ class Parameters:
     verify: VerifyParameters = field(default_factory=VerifyParameters)
     isolate: IsolationParameters = field(default_factory=IsolationParameters)
     assembly: AssemblyParameters = field(default_factory=AssemblyParameters)
+    priors: Priors = field(default_factory=Priors)
 
 
 PRESETS = {
