@@ -155,7 +155,7 @@ def sensors(seed: int, wants: Wants) -> Iterator[Trial]:
     for sensor in SENSORS:
         for there in ("with", "without"):
             for preset in ("default", sensor):
-                case = f"{sensor} {part.name} {there}, {'preset' if preset == sensor else 'default'}"
+                case = f"{sensor} {part.name} {there} {'preset' if preset == sensor else 'default'}"
                 if not wants(("sensors", case, seed)):
                     continue
                 scene = scene or shop(seed, part.mesh, clutter=CLUTTER)
