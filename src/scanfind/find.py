@@ -64,7 +64,7 @@ def find(
 
         scans : files, (N, 3) float64 arrays in metres, or PointClouds; several are one scene
         models : a ModelLibrary or its path, meshes, pieces of scan, or files of them
-        parameters : by stage; None: the default preset
+        parameters : by stage, and what is known beforehand (`priors`); None: the default preset
         seed : of everything that is drawn; the same seed finds the same on any number of threads, unless time runs out
         jobs : threads; None: one a core
         origin : (3,) where the scanner stood, for scans that do not say; with none, free space says nothing
@@ -98,7 +98,7 @@ def find(
             grid.add(chunk)
         require_points(sources)
         grid.release()
-        require_points_in(box, grid.points, grid.offset if grid.offset is not None else np.zeros(3))
+        require_points_in(box, grid.points, grid.offset)
 
     for size in found.groups():  # large models first, each size at its own resolution
         found.add(recognise(size, grid, found.standing(), parameters, seed, jobs, clock, tell, at_design=at_design))
@@ -207,10 +207,10 @@ def box_searched(library: Sequence[Model], parameters: Parameters) -> Floats | N
     return box_around(library, priors)
 
 
-def require_points_in(box: Floats | None, points: int, begins: ArrayLike) -> None:
+def require_points_in(box: Floats | None, points: int, begins: ArrayLike | None) -> None:
     """Raise UsageError where of a scan that `begins` at (3,) no point lies where instances are looked for."""
-    if box is not None and not points:
-        low, high, there = (" ".join(f"{x:.1f}" for x in corner) for corner in (*box.tolist(), np.asarray(begins)))
+    if box is not None and begins is not None and not points:
+        low, high, there = (" ".join(f"{x:.1f}" for x in corner) for corner in (*box, np.asarray(begins)))
         msg = (
             f"no point lies where the region, or the design with near_design_m, allows for an instance, {low} to "
             f"{high}; the scan begins about {there}: give both in metres, in the scan's own frame"

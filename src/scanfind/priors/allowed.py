@@ -33,19 +33,20 @@ def allowed_poses(models: Sequence[Model], priors: Priors, offset: Floats) -> Al
     """What hypotheses of some models are held against before they are tested; offset : (3,) of the grid."""
     from scanfind.kernels.allowed import Allowed
 
-    slack = DRAWN_IN * np.array([model.diameter for model in models])
-    box = priors.box(float((DRAWN_IN + RIM) / DRAWN_IN * slack.max()))
+    diameters = [model.diameter for model in models]
+    box = priors.box((RIM + DRAWN_IN) * max(diameters))
     up = np.zeros(3) if priors.up is None else unit(direction(priors.up))
     tilt = np.radians(priors.tilt_deg + LEANING_DEG)
     cones: list[Floats] = []
     places: list[Floats] = []
-    for model, more in zip(models, slack, strict=True):
+    for model, diameter in zip(models, diameters, strict=True):
         around = np.empty((0, 4)) if priors.up is None else cones_of(model, direction(priors.model_up))
         least, most = np.cos(np.minimum(around[:, 3] + tilt, np.pi)), np.cos(np.maximum(around[:, 3] - tilt, 0.0))
         cones.append(np.column_stack([around[:, :3], least - 1e-9, most + 1e-9]))
         near = priors.near_design_m
         middles = [] if near is None else [at.move(middle_of(model)[None])[0] - offset for at in designs_of(model)]
-        places.append(np.array([[*middle, near + more] for middle in middles]).reshape(-1, 4))
+        reach = (near or 0.0) + DRAWN_IN * diameter
+        places.append(np.array([[*middle, reach] for middle in middles]).reshape(-1, 4))
     known = (priors.region, priors.outline, priors.up, priors.near_design_m) != (None, None, None, None)
     return Allowed(
         known, np.array([middle_of(model) for model in models]),
