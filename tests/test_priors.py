@@ -170,7 +170,8 @@ def test_a_model_drawn_on_its_side_stands_as_it_was_drawn() -> None:
 def test_only_what_stands_near_the_design_is_found() -> None:
     for name, place in PLACES.items():
         design = Pose(place.rotation, place.translation + np.array([0.3, 0.0, 0.0]))
-        placed = Mesh("bracket", BRACKET.vertices, BRACKET.faces, "", (Placement("1", "", "", design),))
+        placed = ModelLibrary.in_memory()
+        placed.put(replace(bracket(), placements=(Placement("1", "", "", design),)))
         assert named(seek(Priors(near_design_m=0.4, turned_deg=5.0), models=placed)) == [name]
     short = replace(QUICK, search=replace(QUICK.search, time_limit_s=1.0))
     found = seek(Priors(near_design_m=0.2), short, models=placed)
