@@ -24,6 +24,7 @@ from benchmarks.recognition.scenes import CLUTTER, behind_boards, free, meant, p
 from benchmarks.recognition.sensors import SENSORS, framed
 from benchmarks.recognition.trial import Key, Trial
 from scanfind.mesh import Mesh
+from scanfind.parameters import PRESETS
 from scanfind.simulate.objects import FRAME_MEMBER_M, FRAME_SIZE_M, SpoolDesign, spool
 from scanfind.simulate.piping import plant
 from scanfind.simulate.scenes import shop
@@ -147,14 +148,14 @@ def choice(seed: int, wants: Wants) -> Iterator[Trial]:
 def sensors(seed: int, wants: Wants) -> Iterator[Trial]:
     """A part in clouds by other sensors, and the same scene without it; even seeds the spool, odd ones the frame.
 
-    Six other spools stand about. Each cloud is searched with the default parameters and with the sensor's
-    preset. Success: without, nothing is reported; with, the part is, within NOISY_MM and NOISY_DEG, and nothing else.
+    Six other spools stand about. Each cloud is searched with the default parameters and with the sensor's preset, where
+    there is one. Success: without, nothing is reported; with, the part is, within NOISY_MM and NOISY_DEG, and nothing else.
     """
     part = (pipe_spool_part, box_frame_part)[seed % 2]()
     scene, framed_there = None, None
     for sensor in SENSORS:
         for there in ("with", "without"):
-            for preset in ("default", sensor):
+            for preset in ("default", sensor) if sensor in PRESETS else ("default",):
                 case = f"{sensor} {part.name} {there} {'preset' if preset == sensor else 'default'}"
                 if not wants(("sensors", case, seed)):
                     continue

@@ -60,10 +60,6 @@ PRESETS = {
     # Noise that grows with the square of the range; one view, from a known place: free space tells what is missing.
     # Frames are dense, and need no lines to be found by: these are what the wrong pose of 0.19 was told by.
     "structured-light": Parameters(grid=COARSE, search=SearchParameters(by_lines=False), verify=LENIENT),
-    # No free space, so that support is all there is, and what forgives noise forgives a likeness as well: a mirrored
-    # spool had 0.45 so in a SLAM scan. Larger cells alone bridge holes without texture, and passes off by a centimetre.
-    "photogrammetry": Parameters(grid=COARSE),
-    "slam": Parameters(grid=COARSE),
     # Table 2 of the paper and what its text says: one pair distance, uniform draws, normals of unit length, all of the
     # time, five steps of ICP, the best single hypothesis by support alone.
     "sharif2017": Parameters(

@@ -106,7 +106,7 @@ def find(
     json
         Print results.json on stdout instead of a table.
     preset
-        Settings to start from: default, structured-light, photogrammetry, slam or sharif2017.
+        Settings to start from: default, structured-light or sharif2017.
     config
         A TOML file of settings; flags and SCANFIND_... variables win over it.
     seed
