@@ -149,7 +149,8 @@ def sensors(seed: int, wants: Wants) -> Iterator[Trial]:
     """A part in clouds by other sensors, and the same scene without it; even seeds the spool, odd ones the frame.
 
     Six other spools stand about. Each cloud is searched with the default parameters and with the sensor's preset, where
-    there is one. Success: without, nothing is reported; with, the part is, within NOISY_MM and NOISY_DEG, and nothing else.
+    there is one. Success: without, nothing is reported; with, the part is, within NOISY_MM and NOISY_DEG, and nothing
+    else.
     """
     part = (pipe_spool_part, box_frame_part)[seed % 2]()
     scene, framed_there = None, None
