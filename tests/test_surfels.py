@@ -411,3 +411,19 @@ def test_scenes_of_next_to_nothing_are_scenes(points: Floats) -> None:
     scene = resampled(points, CELL, GridParameters())
     assert not scene.fine.has_normal().any()
     assert scene.points == len(points)
+
+
+def test_of_points_outside_of_a_box_only_beams_are_noted() -> None:
+    """The grid holds what one of the points inside would, and every depth map is that of all points."""
+    rng, origin = np.random.default_rng(0), np.array([0.3, 0.2, 0.1])
+    xyz, box = rng.uniform(-2.0, 2.0, (20_000, 3)), np.array([[-1.0, -0.5, -2.0], [1.0, 2.0, 0.5]])
+    inside = ((xyz >= box[0]) & (xyz <= box[1])).all(axis=1)
+    grids = [MomentGrid(0.1, np.zeros(3), jobs=jobs, box=limits) for jobs, limits in ((3, box), (1, None), (1, None))]
+    for grid, points in zip(grids, (xyz, xyz, xyz[inside]), strict=True):
+        for half in np.array_split(points, 2):
+            grid.add(PointChunk(half, {}, np.arange(len(half)), origin=origin))
+        grid.release()
+    boxed, whole, few = grids
+    assert boxed.points == few.points == inside.sum()
+    np.testing.assert_array_equal(np.concatenate(list(boxed.rows())), np.concatenate(list(few.rows())))
+    np.testing.assert_array_equal(boxed.beams()[0].nearest, whole.beams()[0].nearest)

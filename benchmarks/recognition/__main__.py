@@ -26,7 +26,7 @@ def main(
 ) -> None:  # fmt: skip
     """Search the scenes of some lines; rows already there are not searched again.
 
-    :param line: alarms, instances, occlusion, likeness, pose, library, choice; several with commas.
+    :param line: alarms, instances, occlusion, likeness, pose, library, choice, sensors; several with commas.
     :param seeds: of the scenes; 0-99 are for tuning, 7400 and up for publication.
     :param cases: only cases of these names, such as "pipe_spool without,rating".
     :param out: folder for recognition_<line>.csv.

@@ -33,7 +33,8 @@ FREE_STATIONS_M = 5.0
 def meant(scene: Scene, names: Sequence[str], left_out: Sequence[str] = ()) -> Scene:
     """The same scene with the targets of other names as decoys, and those of `left_out` taken away."""
     kept = [thing for thing in scene.objects if not (thing.target and thing.name in left_out)]
-    return Scene(tuple(replace(thing, target=thing.target and thing.name in names) for thing in kept), scene.stations)
+    marked = tuple(replace(thing, target=thing.target and thing.name in names) for thing in kept)
+    return replace(scene, objects=marked)
 
 
 def points_for(scene: Scene) -> int:

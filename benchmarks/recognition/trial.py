@@ -10,6 +10,7 @@ import numpy as np
 from benchmarks.common import Floats, PoseError
 from benchmarks.recognition.parts import Part
 from benchmarks.recognition.scenes import visible_shares
+from benchmarks.recognition.sensors import SENSORS
 from scanfind.pose import Pose
 from scanfind.simulate.scanner import SimulatedScan, scan
 from scanfind.simulate.scene import Scene
@@ -31,10 +32,12 @@ class Instance:
     object_id: int
     pose: Pose
     visible: float
+    right_mm: float = RIGHT_MM
+    least_deg: float = RIGHT_DEG
 
     def is_right(self, found: Pose) -> bool:
         """Is a pose this instance's own?"""
-        return self.error(found).within(RIGHT_MM, right_deg(self.part))
+        return self.error(found).within(self.right_mm, max(self.least_deg, right_deg(self.part)))
 
     def error(self, found: Pose) -> PoseError:
         """Modulo the part's symmetry."""
@@ -49,6 +52,9 @@ class Trial:
     sought : all parts of the library
     points : about how many the scan has
     rivals : parts sought, or the part itself, that an instance may be taken for: asked how many points tell
+    preset : of parameters, that the search is made with
+    sensor : that scans the scene, one of SENSORS; None: a terrestrial scanner
+    right_mm, least_deg : how far from the truth a pose is still right
     instance objects are those of the scene that are marked as targets; each has the name of its part
     """
 
@@ -59,6 +65,10 @@ class Trial:
     sought: tuple[Part, ...]
     points: int
     rivals: tuple[Part, ...] = ()
+    preset: str = "default"
+    sensor: str | None = None
+    right_mm: float = RIGHT_MM
+    least_deg: float = RIGHT_DEG
 
     def key(self) -> Key:
         """What it is about, within one benchmark."""
@@ -67,7 +77,9 @@ class Trial:
     @cached_property
     def scanned(self) -> SimulatedScan:
         """Its scan."""
-        return scan(self.scene, seed=self.seed, points=self.points)
+        if self.sensor is None:
+            return scan(self.scene, seed=self.seed, points=self.points)
+        return SENSORS[self.sensor](self.scene, self.seed, self.points)
 
     @cached_property
     def instances(self) -> list[Instance]:
@@ -75,7 +87,8 @@ class Trial:
         by_name = {part.name: part for part in self.sought}
         objects, ids = self.scene.objects, self.scene.target_ids()
         seen = zip(ids, visible_shares(self.scene, ids), strict=True)
-        return [Instance(by_name[objects[k].name], k, objects[k].pose, share) for k, share in seen]
+        limits = self.right_mm, self.least_deg
+        return [Instance(by_name[objects[k].name], k, objects[k].pose, share, *limits) for k, share in seen]
 
     def points_on(self, instance: Instance) -> Floats:
         """(N, 3): the scanned points of an instance, scene frame."""

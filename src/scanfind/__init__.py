@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from scanfind.models import read_models
     from scanfind.parameters import PRESETS, Parameters
     from scanfind.pose import Pose
+    from scanfind.priors import Priors
     from scanfind.results import read_results, write_results
     from scanfind.scans import read_scan, scan_info
     from scanfind.symmetry import Symmetry, pose_error
@@ -44,6 +45,7 @@ __all__ = [
     "Parameters",
     "PointCloud",
     "Pose",
+    "Priors",
     "ScanfindError",
     "Symmetry",
     "__version__",
@@ -75,6 +77,7 @@ _HOME = {
     "Mesh": "mesh",
     "read_models": "models",
     "Pose": "pose",
+    "Priors": "priors",
     "read_results": "results",
     "write_results": "results",
     "read_scan": "scans",

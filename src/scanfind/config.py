@@ -145,7 +145,7 @@ def nested(dotted: str, value: object) -> dict[str, Any]:
 def flag_name(key: str) -> str:
     """How the command line spells a setting: search.time_limit_s → --time-limit."""
     last = key.rpartition(".")[2]
-    return "--" + last.removesuffix("_s").removesuffix("_m").replace("_", "-")
+    return "--" + last.removesuffix("_s").removesuffix("_m").removesuffix("_deg").replace("_", "-")
 
 
 def pick(layer: Layer, keys: set[str]) -> Layer:
@@ -180,7 +180,7 @@ def checked(value: object, hint: Any, where: str, name: str) -> Any:
     """The value as the field's type; UsageError in one line where it is none."""
     if value == "none" and type(None) in get_args(hint):
         return None  # neither TOML nor the environment has a word for it
-    if isinstance(value, str) and _is_tuple(hint):
+    if isinstance(value, str) and _is_tuple(hint) and value not in _words(hint):
         value = [part.strip() for part in value.split(",")]
     try:
         checked = TypeAdapter(hint).validate_python(value)
@@ -200,6 +200,11 @@ def checked(value: object, hint: Any, where: str, name: str) -> Any:
 
 def _is_tuple(hint: Any) -> bool:
     return any(get_origin(kind) is tuple for kind in (hint, *get_args(hint)))
+
+
+def _words(hint: Any) -> list[Any]:
+    """The words a hint knows beside its tuple, as an axis beside a direction in numbers."""
+    return [word for kind in (hint, *get_args(hint)) if get_origin(kind) is Literal for word in get_args(kind)]
 
 
 def _length(hint: Any) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -185,6 +186,7 @@ class Findings(list[Detection]):
     allowed_m : by how much an element may be off, metres; None: nobody says
     missing : scans that could not be read and were left out, and why
     alignment : where the design lies in the scans, where that was found; None: they are in one frame
+    expected : how many instances of a model, by its name, were expected; of others nobody said
     """
 
     refused: list[Refused]
@@ -198,9 +200,15 @@ class Findings(list[Detection]):
     allowed_m: float | None
     missing: list[str]
     alignment: Alignment | None
+    expected: dict[str, int]
 
     def __init__(self, detections: list[Detection] | None = None) -> None:
         super().__init__(detections or [])
         self.refused, self.scans, self.notes, self.elements, self.missing = [], [], [], [], []
         self.shift, self.crs, self.timings_s, self.tolerance_m = (0.0, 0.0, 0.0), None, {}, None
-        self.allowed_m, self.alignment = None, None
+        self.allowed_m, self.alignment, self.expected = None, None, {}
+
+    def as_expected(self) -> list[str]:
+        """Of each model of which so many were expected, how many were found, in words."""
+        found = Counter(one.model for one in self)
+        return [f"{name}: {found[name]} of {count} expected found" for name, count in self.expected.items()]

@@ -27,6 +27,7 @@ from scanfind.library.near_surface import near_model, near_triangles
 from scanfind.mesh import Mesh
 from scanfind.parameters import PRESETS, IsolationParameters, Parameters
 from scanfind.pose import Pose
+from scanfind.priors.allowed import box_around
 from scanfind.recognition.recognise import Recognition
 from scanfind.recognition.sizes import Sizes
 from scanfind.scans.sources import Scan, Sources, require_points
@@ -63,7 +64,7 @@ def find(
 
         scans : files, (N, 3) float64 arrays in metres, or PointClouds; several are one scene
         models : a ModelLibrary or its path, meshes, pieces of scan, or files of them
-        parameters : by stage; None: the default preset
+        parameters : by stage, and what is known beforehand (`priors`); None: the default preset
         seed : of everything that is drawn; the same seed finds the same on any number of threads, unless time runs out
         jobs : threads; None: one a core
         origin : (3,) where the scanner stood, for scans that do not say; with none, free space says nothing
@@ -88,13 +89,16 @@ def find(
         sources = Sources(scans, origin)
     with clock("library"):
         library = models_of(models, parameters, units, select)  # 3.2 model library: surface, pairs, hash table
+        box = box_searched(library, parameters)
 
     with clock("grid"):  # 3.1, 3.3 scene representation: the weighted octree, in one pass
         found = Sizes(library, parameters)
-        grid = MomentGrid(found.finest_cell(), jobs=jobs)
+        grid = MomentGrid(found.finest_cell(), jobs=jobs, box=box)
         for chunk in watched(sources.chunks(), clock, tell, "read", sources.expected()):
             grid.add(chunk)
         require_points(sources)
+        grid.release()
+        require_points_in(box, grid.points, grid.offset)
 
     for size in found.groups():  # large models first, each size at its own resolution
         found.add(recognise(size, grid, found.standing(), parameters, seed, jobs, clock, tell, at_design=at_design))
@@ -124,7 +128,8 @@ def find(
         with clock("verify"):
             findings.elements = found.elements(findings)
     findings.scans = [source.told() for source in sources.all]
-    findings.crs, findings.notes = sources.crs(), found.notes()
+    findings.expected = parameters.priors.expected([model.name for model in library])
+    findings.crs, findings.notes = sources.crs(), [*findings.as_expected(), *found.notes()]
     findings.shift = found.shift()
     findings.timings_s = clock.timings()
     return findings
@@ -190,6 +195,27 @@ def models_of(
         msg = "find: no model to look for: the library is empty; add one with `scanfind library add`"
         raise UsageError(msg)
     return sought
+
+
+def box_searched(library: Sequence[Model], parameters: Parameters) -> Floats | None:
+    """The box (2, 3), scans' frame, metres, that holds every instance the priors allow for; None: anywhere.
+
+    Raises UsageError for priors that do not fit the models.
+    """
+    priors = parameters.priors
+    priors.check([model.name for model in library], parameters.search.max_instances)
+    return box_around(library, priors)
+
+
+def require_points_in(box: Floats | None, points: int, begins: ArrayLike | None) -> None:
+    """Raise UsageError where of a scan that `begins` at (3,) no point lies where instances are looked for."""
+    if box is not None and begins is not None and not points:
+        low, high, there = (" ".join(f"{x:.1f}" for x in corner) for corner in (*box, np.asarray(begins)))
+        msg = (
+            f"no point lies where the region, or the design with near_design_m, allows for an instance, {low} to "
+            f"{high}; the scan begins about {there}: give both in metres, in the scan's own frame"
+        )
+        raise UsageError(msg)
 
 
 def is_library(path: str | PathLike[str]) -> bool:

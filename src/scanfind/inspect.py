@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Literal
 from scanfind.design.alignment import CELL_M, fitted, lies_at
 from scanfind.design.elements import INSTALLED, installed, placements_of
 from scanfind.design.thinned import Thinned
-from scanfind.errors import AlignmentError
+from scanfind.errors import AlignmentError, UsageError
 from scanfind.evidence.free_space import Spoken
 from scanfind.find import find, models_of
 from scanfind.library import ModelLibrary
 from scanfind.parameters import PRESETS, Parameters
+from scanfind.priors.allowed import middle_of
 from scanfind.scans.sources import Sources
 
 if TYPE_CHECKING:
@@ -23,7 +24,9 @@ if TYPE_CHECKING:
     from scanfind.detection import Findings
     from scanfind.find import ModelInput
     from scanfind.library.model import Model
+    from scanfind.mesh import Placement
     from scanfind.pose import Pose
+    from scanfind.priors import Priors
     from scanfind.progress import Progress
     from scanfind.scans.sources import Scan
 
@@ -45,7 +48,8 @@ def inspect(
     """Say of every element of a design what became of it: see `Findings.elements`.
 
         scans, parameters, seed, jobs, origin, units, select, progress : as for `find`
-        design : models with their places, such as an IFC file, or models drawn where they should stand
+        design : models with their places, such as an IFC file, or models drawn where they should stand; with a region
+            among the priors those elements whose place is in it
         align : find from the elements where the design lies in the scans: "always"; "never", they are in one frame;
             "auto": where nothing at all is in its place
         upright : up is the same in design and scans
@@ -55,7 +59,12 @@ def inspect(
     Raises as `find` does; with "always" AlignmentError, where the design fits nowhere, or in two ways.
     """
     parameters = parameters or PRESETS["default"]
-    models = models_of(design, parameters, units, select)
+    models, priors = models_of(design, parameters, units, select), parameters.priors
+    if priors.box() is not None or priors.near_design_m is not None:
+        if align == "always":
+            msg = "inspect: a region, or how near to the design, needs scans and design in one frame: leave out align"
+            raise UsageError(msg)
+        models, align = in_region(models, priors), "never"
 
     def found(placed: Sequence[Model], *, at_design: bool, isolate: bool) -> Findings:
         with ModelLibrary.in_memory() as library:
@@ -90,13 +99,31 @@ def inspect(
     return findings
 
 
+def in_region(models: Sequence[Model], priors: Priors) -> list[Model]:
+    """The models with those of their places whose middle lies in the region; raises UsageError where there is none."""
+    kept = []
+    for model in models:
+        middle = middle_of(model)[None]
+        places = [each for each in placements_of(model) if priors.holds(each.design_from_model.move(middle)[0])]
+        kept += [placed_at(model, places)] if places else []
+    if not kept:
+        msg = f"inspect: no element of the design has its place in the region {priors.region or priors.outline}"
+        raise UsageError(msg)
+    return kept
+
+
+def placed_at(model: Model, places: Sequence[Placement]) -> Model:
+    """A model at other places."""
+    mesh = None if model.mesh is None else replace(model.mesh, placements=tuple(places))
+    return replace(model, placements=tuple(places), mesh=mesh)
+
+
 def moved(model: Model, scene_from_design: Pose) -> Model:
     """A model with its places where a motion puts them."""
-    places = tuple(
+    places = [
         replace(each, design_from_model=scene_from_design @ each.design_from_model) for each in placements_of(model)
-    )
-    mesh = None if model.mesh is None else replace(model.mesh, placements=places)
-    return replace(model, placements=places, mesh=mesh)
+    ]
+    return placed_at(model, places)
 
 
 def retold(element: Element, model: Model, findings: Findings, correction: Pose) -> Element:

@@ -11,6 +11,7 @@ from scanfind.fit.refine import RefineParameters
 from scanfind.grid.scene import GridParameters
 from scanfind.library.pairs import PairParameters
 from scanfind.library.surface import SurfaceParameters
+from scanfind.priors import Priors
 from scanfind.search.surface import SearchParameters
 
 
@@ -34,7 +35,7 @@ class IsolationParameters:
 
 @dataclass(frozen=True)
 class Parameters:
-    """Every parameter of the method, by stage."""
+    """Every parameter of the method, by stage; and what is known of the scene beforehand."""
 
     surface: SurfaceParameters = field(default_factory=SurfaceParameters)
     pairs: PairParameters = field(default_factory=PairParameters)
@@ -44,10 +45,21 @@ class Parameters:
     verify: VerifyParameters = field(default_factory=VerifyParameters)
     isolate: IsolationParameters = field(default_factory=IsolationParameters)
     assembly: AssemblyParameters = field(default_factory=AssemblyParameters)
+    priors: Priors = field(default_factory=Priors)
 
+
+# Of sensors whose points are off by 5 to 15 mm: cells twice as large average four times as many of them (noisy normals
+# are what a surface is not recognised by), and of those that are left more may be off. A frame of structured light then
+# gives its true pose a score of 0.94 to 1.0 where the default gives 0.44 to 0.89. One view hides all but a little of a
+# wrong pose: of those that stood for that 0.12 and 0.19 lay on the scan, of the right ones 0.25 and more.
+COARSE = GridParameters(cells_across=90.0)
+LENIENT = VerifyParameters(inlier_noises=5.0, normal_agreement=0.6, min_support=0.22)
 
 PRESETS = {
     "default": Parameters(),
+    # Noise that grows with the square of the range; one view, from a known place: free space tells what is missing.
+    # Frames are dense, and need no lines to be found by: these are what the wrong pose of 0.19 was told by.
+    "structured-light": Parameters(grid=COARSE, search=SearchParameters(by_lines=False), verify=LENIENT),
     # Table 2 of the paper and what its text says: one pair distance, uniform draws, normals of unit length, all of the
     # time, five steps of ICP, the best single hypothesis by support alone.
     "sharif2017": Parameters(

@@ -2,13 +2,30 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from scanfind.cli.options import Count, Flag, Format, Metres, Names, Paths, Position, Seconds, Units, note, say
+from scanfind.cli.options import (
+    Box,
+    Count,
+    Counts,
+    Degrees,
+    Direction,
+    Flag,
+    Format,
+    Metres,
+    Names,
+    Paths,
+    Position,
+    Seconds,
+    Units,
+    note,
+    say,
+)
 from scanfind.cli.outputs import NOT_AS_WANTED, SCANS_MISSING, results_of
 from scanfind.errors import UsageError
 
@@ -39,6 +56,13 @@ def find(
     tolerance: Metres | None = None,
     parts: Flag = False,
     time_limit: Seconds | None = None,
+    region: Box | None = None,
+    up: Direction | None = None,
+    model_up: Direction | None = None,
+    tilt: Degrees | None = None,
+    near_design: Metres | None = None,
+    turned: Degrees | None = None,
+    expect: Counts | None = None,
     fail_on: Literal["not-found"] | None = None,
     memory: str | None = None,
     workers: Count | None = None,
@@ -54,6 +78,8 @@ def find(
         scanfind find station1.laz station2.laz --library parts.scanfind --json
 
         scanfind find station*.laz --library parts.scanfind --memory 3GB --out site
+
+        scanfind find shop.e57 --model spool.stl --region 0,0,0,8,5,3 --up z --expect 2
 
     Parameters
     ----------
@@ -80,7 +106,7 @@ def find(
     json
         Print results.json on stdout instead of a table.
     preset
-        Settings to start from: default or sharif2017.
+        Settings to start from: default, structured-light or sharif2017.
     config
         A TOML file of settings; flags and SCANFIND_... variables win over it.
     seed
@@ -97,8 +123,22 @@ def find(
         Fit the parts of each model one by one: find what was not built to the drawing, and tell which part is off.
     time_limit
         Search no longer than this, seconds.
+    region
+        Only instances whose middle lies in this box of the scan, low corner then high, metres.
+    up
+        Instances stand upright as they were drawn: this way is up in the scans.
+    model_up
+        The way that is up in the models as drawn; z unless given.
+    tilt
+        By how much they may lean then; 10 degrees unless given.
+    near_design
+        Only instances whose middle is this near to where the design puts it (or the model is drawn), metres.
+    turned
+        By how much they may be turned from the design then.
+    expect
+        How many there are of each model: with so many found its search ends, with fewer it goes on until --time-limit.
     fail_on
-        Exit with 3 if some model was not found.
+        Exit with 3 if some model was not found, or fewer of it than expected.
     memory
         Search in tiles that fit a memory such as 3GB, of all workers together; a scan that cannot be read is left out.
     workers
@@ -116,7 +156,7 @@ def find(
         msg = "find: --remainder has nowhere to go: give --out DIR"
         raise UsageError(msg)
 
-    from scanfind.cli.inputs import open_models
+    from scanfind.cli.inputs import expected, open_models
     from scanfind.cli.tiled import Tiled
     from scanfind.config import load_settings
     from scanfind.find import find as find_models
@@ -129,6 +169,8 @@ def find(
         "preset": preset, "seed": seed, "jobs": jobs, "units": units, "origin": origin, "format": format,
         "select": select, "search.max_instances": max_instances, "search.time_limit_s": time_limit,
         "verify.min_score": min_score, "isolate.tolerance_m": tolerance, "assembly.parts": parts or None,
+        "priors.region": region, "priors.up": up, "priors.model_up": model_up, "priors.tilt_deg": tilt,
+        "priors.near_design_m": near_design, "priors.turned_deg": turned, "priors.expect": expected(expect),
     }  # fmt: skip
     run, parameters = load_settings(PRESETS, flags, config)
     files = [Path(file) for scan in scans for file in files_of(scan)]
@@ -150,7 +192,8 @@ def find(
     if tiled is not None:
         tiled.finished()
     report(results, out, json=json)
-    missing = {entry.name for entry in results.models} - {found.model for found in results.detections}
+    found = Counter(one.model for one in results.detections)
+    missing = [entry.name for entry in results.models if found[entry.name] < (entry.expected or 1)]
     if fail_on == "not-found" and missing:
         return NOT_AS_WANTED
     return SCANS_MISSING if findings.missing else 0

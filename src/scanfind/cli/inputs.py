@@ -8,11 +8,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scanfind.cli.options import note
+from scanfind.errors import UsageError
 
 if TYPE_CHECKING:
     from scanfind.config import Run
     from scanfind.library import ModelLibrary
     from scanfind.parameters import Parameters
+
+
+def expected(counts: Sequence[str] | None) -> int | dict[str, int] | None:
+    """Of --expect: a number for every model, or MODEL=N for some; None where nothing is expected. Raises UsageError."""
+    if counts is None:
+        return None
+    if len(counts) == 1 and counts[0].isdigit():
+        return int(counts[0])
+    by_name = {}
+    for count in counts:
+        name, _, number = count.rpartition("=")
+        if not (name and number.isdigit()):
+            msg = f"--expect: takes a number for every model, or MODEL=N for each of some, got {count!r}"
+            raise UsageError(msg)
+        by_name[name] = int(number)
+    return by_name
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from scanfind.cli.options import Count, Flag, Format, Metres, Names, Paths, Position, Seconds, Units, note, say
+from scanfind.cli.options import Box, Count, Flag, Format, Metres, Names, Paths, Position, Seconds, Units, note, say
 from scanfind.cli.outputs import NOT_AS_WANTED, results_of
 from scanfind.errors import UsageError
 
@@ -34,6 +34,8 @@ def inspect(
     jobs: Count | None = None,
     tolerance: Metres | None = None,
     time_limit: Seconds | None = None,
+    region: Box | None = None,
+    near_design: Metres | None = None,
     align: Literal["auto", "always", "never"] = "auto",
     upright: Flag = False,
     fail_on: Literal["not-found", "out-of-tolerance"] | None = None,
@@ -80,6 +82,10 @@ def inspect(
         Points this near to a found element are its own, metres.
     time_limit
         Look for elements that are not in their place no longer than this, seconds.
+    region
+        Only elements whose place is in this box of the scan, low corner then high, metres.
+    near_design
+        Look for elements that are not in their place no farther from it than this, metres.
     align
         Find where the design lies in the scans: auto, where nothing is in its place; always; never.
     upright
@@ -105,6 +111,7 @@ def inspect(
     flags = {
         "seed": seed, "jobs": jobs, "units": units, "origin": origin, "format": format, "select": select,
         "search.time_limit_s": time_limit, "isolate.tolerance_m": tolerance,
+        "priors.region": region, "priors.near_design_m": near_design,
     }  # fmt: skip
     run, parameters = load_settings(PRESETS, flags, config)
     with ExitStack() as stack:

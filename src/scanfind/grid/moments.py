@@ -9,6 +9,7 @@ from __future__ import annotations
 import mmap
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial, reduce
+from itertools import pairwise
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -43,6 +44,7 @@ class MomentGrid:
     the first points, rounded to whole metres, so that coordinates keep their digits however far from zero the scan is).
     jobs : threads; expected_rows : where more are known to come, arrays need not be doubled, for a moment holding twice
     as much
+    box : (2, 3) low and high corner, the points' frame, metres: of points outside only the beams are noted
 
     points : added so far
     signed : every chunk said where its scanner stood
@@ -54,12 +56,14 @@ class MomentGrid:
     """
 
     def __init__(
-        self, cell: float, offset: Floats | None = None, jobs: int = 1, expected_rows: int = EMPTY_ROWS
-    ) -> None:
+        self, cell: float, offset: Floats | None = None, jobs: int = 1, expected_rows: int = EMPTY_ROWS,
+        box: Floats | None = None,
+    ) -> None:  # fmt: skip
         from scanfind.kernels.grid import MOMENTS, OFFSET_UNITS
 
         self.cell = cell
         self.offset = offset
+        self.box = box
         self.points = 0
         self.signed = True
         self.units = OFFSET_UNITS
@@ -95,13 +99,29 @@ class MomentGrid:
         origin = np.zeros(3) if chunk.origin is None else np.asarray(chunk.origin, np.float64)
         seen = self._beams_from(origin - self.offset) if has_origin else np.empty((self._shards, 0), np.int64)
         xyz, offset = chunk.xyz, self.offset
+        if self.box is not None:
+            inside = ((xyz >= self.box[0]) & (xyz <= self.box[1])).all(axis=1)
+            if has_origin:
+                self._note_beams(xyz[~inside], origin, seen)
+            xyz = xyz[inside]
         self._in_shards(
-            len(chunk),
+            len(xyz),
             lambda at, shard, arrays: accumulate(
                 xyz, at, origin, has_origin, offset, self.cell, shard, self._shards, *arrays, seen[shard], DEPTH_PIXELS
             ),
         )
-        self.points += len(chunk)
+        self.points += len(xyz)
+
+    def _note_beams(self, xyz: Floats, origin: Floats, seen: Ints) -> None:
+        """Note what beams to points (N, 3) saw, in the maps of the shards: each takes some of them."""
+        from scanfind.kernels.grid import note_beams
+
+        cuts = np.linspace(0, len(xyz), self._shards + 1).astype(np.int64)
+        note = [
+            partial(note_beams, xyz[start:stop], origin, seen[shard], DEPTH_PIXELS)
+            for shard, (start, stop) in enumerate(pairwise(cuts.tolist()))
+        ]
+        side_by_side(self._jobs if len(xyz) >= WORTH_A_THREAD else 1, *note)
 
     def rows(self) -> Iterator[NDArray[Any]]:
         """All moments, as rows (R,) of ROW, some blocks at a time in the order of their keys."""

@@ -22,6 +22,7 @@ DIRECTION_UNITS = 1048576.0
 NO_BEAM = np.int64(1 << 62)
 # A beam's range is kept to 0.06 mm and its direction to a 256th of a pixel, 0.14 mm at 8 m.
 RANGE_UNITS, AIM_UNITS = 16384.0, 256
+FARTHEST_BEAM = 1e6
 ROWS_OF_OCTANT = 64 * 54  # 64 cells, each seen in every one of the bins below
 # Shards lie in one array and take its rows and blocks by lots: large enough that two never write to one page often,
 # small enough that what the last lots leave unused is little (0.4 MB and 0.1 MB a shard).
@@ -232,6 +233,19 @@ def accumulate(
             moments[row, 11] -= np.int64(dy * scale)
             moments[row, 12] -= np.int64(dz * scale)
     return n
+
+
+@kernel
+def note_beams(points, origin, nearest, edge):
+    """Note the beams from a scanner at `origin` (3,) to points (N, 3); nearest : see accumulate."""
+    for i in range(points.shape[0]):
+        dx, dy, dz = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+        distance = sqrt(dx * dx + dy * dy + dz * dz)
+        # What is farther than any instrument reaches (1e38 for "no data") would not fit its place.
+        if 0.0 < distance < FARTHEST_BEAM:
+            face, u, v = cube_place(dx, dy, dz)
+            pixel, beam = pack_beam(face, u, v, edge, distance)
+            nearest[pixel] = min(nearest[pixel], beam)
 
 
 @kernel

@@ -6,6 +6,7 @@ from math import cos, floor, pi, sin, sqrt
 
 import numpy as np
 
+from scanfind.kernels.allowed import may_be
 from scanfind.kernels.blocks import find_block, insert_block, pack_block, unpack_block
 from scanfind.kernels.features import angle_between, feature_key
 from scanfind.kernels.grid import cube_pixel
@@ -230,7 +231,7 @@ def fetch(points, normals, i, sign, point, normal):
 def test_pairs(
     start, stop, pair_first, pair_second, pair_signs, pair_keys, means, normals,
     offsets, entry_model, entry_first, entry_second, model_starts, model_points, model_normals, samples,
-    length, cell, hash_keys, hash_values, occupied, masks, least_hits, origins,
+    length, cell, hash_keys, hash_values, occupied, masks, least_hits, origins, allowed,
     best_support, best_model, best_rotation, best_translation,
 ):  # fmt: skip
     """Test every hypothesis of scene pairs start … stop; keep the best of each pair.
@@ -241,6 +242,7 @@ def test_pairs(
     length : metres, of the normals in the four-point sets; 0 for the limit (see pair_pose)
     least_hits : (T+1,) Wald's test as a table: after k points fewer hits than least_hits[k] end it
     origins : (K, 3) scanner positions: samples that face none of them are passed over; none: all are tested
+    allowed : which poses are worth a test
     best_support : out, share of hits among the samples tested; 0 where no hypothesis passed
     """
     inverse = 1.0 / cell
@@ -265,6 +267,8 @@ def test_pairs(
             if length > 0.0:
                 refine_four_points(m1, a1, m2, a2, s1, b1, s2, b2, length, rotation)
             place_pair(m1, a1, m2, a2, s1, b1, s2, b2, length, rotation, translation)
+            if not may_be(allowed, which, rotation, translation):
+                continue
             hits = tested = 0
             for t in range(n):
                 found = lies_on_scene(

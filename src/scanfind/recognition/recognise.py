@@ -32,6 +32,7 @@ from scanfind.fit.polish import polish
 from scanfind.fit.refine import Refined, covariance_of, held, icp, shrinking, triple, unobservable
 from scanfind.library.near_surface import near_model, signed_distances
 from scanfind.pose import Pose
+from scanfind.priors.allowed import OUTSIDE, why_not
 from scanfind.search.hypotheses import Hypotheses, joined, model_arrays
 from scanfind.search.lines import LineSearch
 from scanfind.search.surface import Search
@@ -110,7 +111,7 @@ class Recognition:
     ) -> None:  # fmt: skip
         self.scene, self.models, self.parameters, self.jobs = scene, models, parameters, jobs
         self.arrays = model_arrays(models)
-        self.search = Search(scene, models, table, self.arrays, parameters.search, seed, jobs)
+        self.search = Search(scene, models, table, self.arrays, parameters.search, seed, jobs, parameters.priors)
         fine, coarse = self.search.telling()
         inlier = parameters.verify.inlier_noises * scene.noise
         inliers = [inlier + parameters.verify.inlier_cells * level.cell for level in (scene.fine, scene.coarse)]
@@ -125,7 +126,9 @@ class Recognition:
         self._refused: list[tuple[Candidate, str]] = []
         self._standing = standing
         self._ran_out_of_time = False
-        self._wanted = np.full(len(models), parameters.search.expected or np.iinfo(np.int64).max)
+        expected = parameters.priors.expected([model.name for model in models])
+        self._expected = np.array([expected.get(model.name, 0) for model in models])
+        self._wanted = np.where(self._expected > 0, self._expected, np.iinfo(np.int64).max)
         diameters = np.array([model.diameter for model in models])
         # Poses closer than a thirtieth of the diameter meet in one ICP; after it a hundredth tells them apart.
         self._apart_before, self._apart_after = diameters / 30.0, diameters / 100.0
@@ -142,15 +145,31 @@ class Recognition:
         """Is another round worth it: time left, instances wanted, and the chance of having missed one too high?"""
         limits = self.parameters.search
         if limits.time_limit_s is not None and seconds >= limits.time_limit_s:
-            self._ran_out_of_time = limits.miss_probability > 0.0
+            self._ran_out_of_time = self.search.chance_missed() > limits.miss_probability > 0.0
             return False
         if limits.miss_probability <= 0.0:
             return self.search.pool_left()
-        enough = limits.max_instances is not None and len(self.believed) >= limits.max_instances
+        enough = limits.max_instances is not None and self._found().sum() >= limits.max_instances
         if enough:
             return False
-        # With nothing to show, rather a longer search than an answer that the next seed contradicts.
-        return not self.search.may_stop() or (not self.believed and (self._untried() or self.search.look_deeper()))
+        # With less to show than is expected, rather a longer search than an answer that the next seed contradicts.
+        short = not self.believed or self._fewer_than_expected()
+        if not self.search.may_stop() or (short and (self._untried() or self.search.look_deeper())):
+            return True
+        return self._fewer_than_expected() and limits.time_limit_s is not None and self.search.pool_left()
+
+    def _fewer_than_expected(self) -> bool:
+        """Are more instances of some model known to be there than were found?"""
+        return bool((self._found() < self._expected).any())
+
+    def _found(self) -> NDArray[np.intp]:
+        """How many instances of each model are believed, (models,)."""
+        return np.bincount([candidate.model for candidate in self.reported()], minlength=len(self.models))
+
+    def reported(self) -> list[Candidate]:
+        """What is believed and lies in the region; the others claim what is theirs of it."""
+        middles, holds = self.arrays.centres, self.parameters.priors.holds
+        return [c for c in self.believed if holds(self.pose_of(c).move(middles[c.model][None])[0])]
 
     def _untried(self) -> bool:
         """Are lines still to be asked?"""
@@ -161,8 +180,8 @@ class Recognition:
         these found nothing, of lines.
         """
         if self._untried() and (self.search.rounds or not self.search.pool_left()):
-            found = np.isin(np.arange(len(self.models)), [candidate.model for candidate in self.believed])
-            self._lines = LineSearch(self.scene, self.models, ~found, self.parameters.search, self._seed, self.jobs)
+            limits, priors, found = self.parameters.search, self.parameters.priors, self._found() > 0
+            self._lines = LineSearch(self.scene, self.models, ~found, limits, self._seed, self.jobs, priors)
             if self._lines:
                 # What was refused for telling too little may be told by its lines.
                 again = [self._placements(c.model, [Pose(c.rotation, c.translation)]) for c, _ in self._refused]
@@ -368,7 +387,7 @@ class Recognition:
         for candidate in self.believed:
             self._claim(candidate, claimed)
         for candidate in sorted(elsewhere, key=lambda c: -c.area):
-            if reason := why_refused(candidate.evidence, self.blind, verify):
+            if reason := self._why_not_known(candidate) or why_refused(candidate.evidence, self.blind, verify):
                 self._refused.append((candidate, reason))
             elif not self._shares(candidate, claimed):
                 self.believed.append(candidate)
@@ -400,8 +419,9 @@ class Recognition:
         verify, settled = self.parameters.verify, {id(candidate) for candidate in self.believed}
         fresh, refused = [], []
         for candidate in self.candidates(refined):
-            reason = why_refused(candidate.evidence, self.blind, verify)
-            if reason:
+            if known := self._why_not_known(candidate):
+                self._refused.append((candidate, known))
+            elif reason := why_refused(candidate.evidence, self.blind, verify):
                 refused.append((candidate, reason))
             else:
                 fresh.append(candidate)
@@ -428,8 +448,7 @@ class Recognition:
     def _settled(self, claimed: NDArray[np.bool_]) -> None:
         """What is believed claims these rows (…,): nothing more is drawn there."""
         self._refused = closest(self._refused)
-        found = np.bincount([c.model for c in self.believed], minlength=len(self.models))
-        self.search.served(found >= self._wanted)
+        self.search.served(self._found() >= self._wanted)
         self.search.withdraw(claimed[self.scene.fine.cells.rows])
 
     def _explained_by_parts(self, refused: Sequence[Candidate], believed: Sequence[Candidate]) -> list[Candidate]:
@@ -556,8 +575,13 @@ class Recognition:
         turned = self._placements(number, others)
         met = self._icp_coarse(turned).hypotheses
         refined = self._icp_fine(met.take(self._promising(met, 0)))
-        sound = [c for c in self.candidates(refined) if not why_refused(c.evidence, self.blind, self.parameters.verify)]
+        verify, found = self.parameters.verify, self.candidates(refined)
+        sound = [c for c in found if not (self._why_not_known(c) or why_refused(c.evidence, self.blind, verify))]
         return max([candidate, *sound], key=lambda c: c.area)
+
+    def _why_not_known(self, candidate: Candidate) -> str:
+        """Why what is known beforehand speaks against a pose, in words; empty where it does not."""
+        return why_not(self.models[candidate.model], self.parameters.priors, self.pose_of(candidate))
 
     def detection(self, number: int, found: Candidate) -> Detection:
         """What is told of something believed, under a number, in the scans' own frame."""
@@ -627,12 +651,13 @@ class Recognition:
 
     def refused(self) -> list[Refused]:
         """What came closest of each model and why it was not believed."""
+        reported = {id(c) for c in self.reported()}
         return [
             Refused(
                 self.models[c.model].name, self._pose(c), c.score, c.evidence.support(), c.evidence.visible_support(),
                 c.evidence.penalty(), reason,
             )
-            for c, reason in self._refused
+            for c, reason in [*self._refused, *((c, OUTSIDE) for c in self.believed if id(c) not in reported)]
         ]  # fmt: skip
 
     def noise(self) -> float:

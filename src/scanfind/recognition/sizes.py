@@ -100,7 +100,7 @@ class Sizes:
 
     def detections(self) -> list[Detection]:
         """What is believed, best first, numbered from 1, in the scans' own frame."""
-        believed = [(candidate, search) for search in self.all for candidate in search.believed]
+        believed = [(candidate, search) for search in self.all for candidate in search.reported()]
         believed.sort(key=lambda one: (-round(one[0].score, 3), -one[0].area))
         return [
             search.detection(number, candidate)

@@ -69,7 +69,7 @@ def document(
             )
             for scan in findings.scans
         ],
-        models=list(models),
+        models=[model.model_copy(update={"expected": findings.expected.get(model.name)}) for model in models],
         detections=[_detection_entry(found, *files.get(found.id, (None, None))) for found in findings],
         refused=[_refused_entry(refused) for refused in findings.refused],
         elements=[_element_entry(element, findings.allowed_m) for element in findings.elements],
@@ -90,6 +90,7 @@ def findings_of(results: schema.Results) -> Findings:
     findings.alignment = None if results.alignment is None else _alignment(results.alignment)
     findings.scans = [SceneScan(scan.path, scan.points, scan.dropped, tuple(scan.stations_m)) for scan in results.scans]
     findings.shift, findings.crs, findings.notes = results.shift_m, results.crs, list(results.notes)
+    findings.expected = {model.name: model.expected for model in results.models if model.expected is not None}
     findings.timings_s, findings.tolerance_m = dict(results.timings_s), results.tolerance_m
     return findings
 

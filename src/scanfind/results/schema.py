@@ -60,7 +60,8 @@ class SymmetryEntry(Entry):
 class ModelEntry(Entry):
     """A model that was sought. `sha256`: of its geometry and of the parameters it was prepared with.
 
-    `symmetry` is null in results of scanfind before it knew of it.
+    `symmetry` is null in results of scanfind before it knew of it. `expected`: how many instances there should be, null
+    where nobody said.
     """
 
     name: str
@@ -68,6 +69,7 @@ class ModelEntry(Entry):
     diameter_m: float
     pairs: int
     symmetry: SymmetryEntry | None = None
+    expected: int | None = None
 
 
 class Quaternion(Entry):

@@ -20,6 +20,7 @@ from scanfind.threads import in_threads
 if TYPE_CHECKING:
     from scanfind.cloud import OrientedCloud
     from scanfind.grid.scene import OrientationGrid
+    from scanfind.kernels.allowed import Allowed
     from scanfind.library import JointTable
     from scanfind.library.pairs import PairParameters
     from scanfind.search.hypotheses import ModelArrays
@@ -124,6 +125,7 @@ class Trial(NamedTuple):
     marks : cells of the scene that know which way what is in them faces
     origins : (K, 3) scanner positions: samples that face none are passed over; empty: all are tested
     least_hits : see `wald_table`; normal_length : metres, see SearchParameters.normal_length_m
+    allowed : which poses are worth a test
     """
 
     table: JointTable
@@ -132,6 +134,7 @@ class Trial(NamedTuple):
     origins: Floats
     least_hits: Ints
     normal_length: float
+    allowed: Allowed
 
     def test(self, pairs: Pairs, of: OrientedCloud, jobs: int) -> Hypotheses:
         """The best hypothesis of each pair that passes, best first; of : the points the pairs are of."""
@@ -147,7 +150,7 @@ class Trial(NamedTuple):
                 start, stop, *pairs, of.points, of.normals, table.offsets, table.model, table.first, table.second,
                 arrays.starts, arrays.points, arrays.normals, arrays.samples, self.normal_length, marks.cell,
                 marks.hash_keys, marks.hash_values, marks.occupied, marks.masks, self.least_hits, self.origins,
-                support, models, rotations, translations,
+                self.allowed, support, models, rotations, translations,
             ),
         )  # fmt: skip
         order = np.argsort(-support, kind="stable")[: np.count_nonzero(support)]

@@ -22,6 +22,8 @@ from scanfind.grid.scene import orientation_grid
 from scanfind.grid.surfels import number
 from scanfind.library import joint_table
 from scanfind.library.pairs import build_pairs, rungs_of
+from scanfind.priors import Priors
+from scanfind.priors.allowed import NOTHING_KNOWN, allowed_poses
 from scanfind.search.draws import Draws, Trial, affordable, wald_table
 from scanfind.search.hypotheses import Hypotheses, joined, model_arrays, no_hypotheses
 from scanfind.threads import in_threads
@@ -56,14 +58,14 @@ class LineSearch:
 
     def __init__(
         self, scene: Scene, models: Sequence[Model], wanted: NDArray[np.bool_], parameters: SearchParameters,
-        seed: int, jobs: int,
+        seed: int, jobs: int, priors: Priors = NOTHING_KNOWN,
     ) -> None:  # fmt: skip
         by_level: dict[int, list[int]] = {}
         for at in np.flatnonzero(wanted).tolist():
             if (level := level_of(models[at], scene.fine.cell)) is not None:
                 by_level.setdefault(level, []).append(at)
         self._windows = [
-            _Window(scene, level, [models[at] for at in some], some, parameters, seed, jobs)
+            _Window(scene, level, [models[at] for at in some], some, parameters, seed, jobs, priors)
             for level, some in sorted(by_level.items())
         ]
 
@@ -92,7 +94,7 @@ class _Window:
 
     def __init__(
         self, scene: Scene, level: int, models: Sequence[Model], which: Sequence[int], parameters: SearchParameters,
-        seed: int, jobs: int,
+        seed: int, jobs: int, priors: Priors,
     ) -> None:  # fmt: skip
         cell = scene.fine.cell * 2.0**level
         self._parameters, self._seed, self._jobs, self._rounds = parameters, seed, jobs, 0
@@ -108,6 +110,7 @@ class _Window:
         self._trial = Trial(
             joint_table(as_lines), model_arrays(as_lines), marks, np.empty((0, 3)),
             wald_table(parameters.tests, SHOWN + (1.0 - SHOWN) * CHANCE, CHANCE), 0.0,
+            allowed_poses(models, priors, scene.fine.cells.offset),
         )  # fmt: skip
         self._by_chance = self._highest_by_chance()
 

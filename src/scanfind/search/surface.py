@@ -14,6 +14,8 @@ from scanfind.cloud import OrientedCloud
 from scanfind.errors import require
 from scanfind.grid.scene import flatness_above
 from scanfind.library.pairs import rungs_of
+from scanfind.priors import Priors
+from scanfind.priors.allowed import NOTHING_KNOWN, allowed_poses
 from scanfind.search.draws import Draws, Trial, affordable, wald_table
 from scanfind.search.hypotheses import Hypotheses, no_hypotheses
 
@@ -66,7 +68,6 @@ class SearchParameters:
     miss_probability : stop when an instance that shows `overlap_ratio` of its surface has been missed with less than
         this chance; 0: use all of the time limit, as the paper does
     max_instances : stop after so many detections; None: all there are
-    expected : instances of each model: one found so many times is looked for no further; None: nobody knows
     pairs_a_round, hypotheses_a_round : scene pairs drawn before any is tested; hypotheses tested before any is refined
     by_shape : draw points by the likelihood ratio of their local shape: how bent the surface around them is, on the
         model as against in the scene; walls and floors are most of a scan and little of a spool
@@ -88,7 +89,6 @@ class SearchParameters:
     time_limit_s: float | None = 60.0
     miss_probability: float = 0.01
     max_instances: int | None = None
-    expected: int | None = None
     pairs_a_round: int = 100_000
     hypotheses_a_round: int = 200_000
     facing_only: bool = True
@@ -112,7 +112,6 @@ class SearchParameters:
             limit is not None or self.miss_probability > 0.0, "time_limit_s", limit, "given where miss_probability is 0"
         )
         require(self.max_instances is None or self.max_instances >= 1, "max_instances", self.max_instances, "1 or more")
-        require(self.expected is None or self.expected >= 1, "expected", self.expected, "1 or more")
         require(0.0 < self.chance_overlap < 0.5, "chance_overlap", self.chance_overlap, "above 0 and below 0.5")
         require(self.normal_length_m >= 0.0, "normal_length_m", self.normal_length_m, "0 or more metres")
         require(self.test_cells_across >= 4.0, "test_cells_across", self.test_cells_across, "4 or more")
@@ -125,9 +124,10 @@ class Search:
 
     def __init__(
         self, scene: Scene, models: Sequence[Model], table: JointTable, arrays: ModelArrays,
-        parameters: SearchParameters, seed: int, jobs: int,
+        parameters: SearchParameters, seed: int, jobs: int, priors: Priors = NOTHING_KNOWN,
     ) -> None:  # fmt: skip
         self.scene, self.models, self.table, self.arrays = scene, models, table, arrays
+        self._allowed = allowed_poses(models, priors, scene.fine.cells.offset)
         self.parameters, self.seed, self.jobs = parameters, seed, jobs
         self.pairs = models[0].parameters.pairs
         self.rungs = sorted({rung for m in models for rung in rungs_of(m.diameter, m.parameters.pairs)}, reverse=True)
@@ -279,7 +279,9 @@ class Search:
         self._expect(count, drawn.keys, tested.keys)
         # The first round finds what is easily seen, in half of the time.
         least = self._least_hits if self.rounds else self._least_hits_at_first
-        trial = Trial(self.table, self.arrays, self.scene.tolerant, self._origins, least, limits.normal_length_m)
+        trial = Trial(
+            self.table, self.arrays, self.scene.tolerant, self._origins, least, limits.normal_length_m, self._allowed
+        )
         self.rounds += 1
         self.effort += share
         self._last_share = share

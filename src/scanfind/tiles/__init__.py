@@ -16,6 +16,7 @@ from __future__ import annotations
 import pickle
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -31,7 +32,7 @@ from scanfind.clock import Clock, say_if_compiling
 from scanfind.cloud import shift_for
 from scanfind.detection import Findings
 from scanfind.errors import Interrupted, UnreadableFileError, UnsupportedFormatError, UsageError
-from scanfind.find import ModelInput, isolation_tolerance, models_of
+from scanfind.find import ModelInput, box_searched, isolation_tolerance, models_of, require_points_in
 from scanfind.fit.polish import polished
 from scanfind.grid.moments import MomentGrid
 from scanfind.isolation.deviation import deviation_of
@@ -149,7 +150,8 @@ def _find(
     sizes = Sizes(library, parameters)
     cell = sizes.finest_cell()
     blocks = bin_blocks(cell, min(model.diameter for model in library))
-    job = Job(folder, cell, (0.0, 0.0, 0.0), blocks, memory, jobs, parameters, seed, listed.origin)
+    box = box_searched(library, parameters)
+    job = Job(folder, cell, (0.0, 0.0, 0.0), blocks, memory, jobs, parameters, seed, listed.origin, box)
     keep_memory(job, sizes, listed, say)
 
     begin(job, listed, library, resume=resume)
@@ -160,6 +162,7 @@ def _find(
         folders = [folder / scan_name(k) for k, one in enumerate(summed) if not one.missing]
         parts = parts_of(folders)
         held = held_by(job, parts, crew)
+        require_points_in(box, int(held.rows.sum()), job.offset)
 
     findings, searched, largest = Findings(), list[Searched](), None
     for group, size in enumerate(sizes.groups()):
@@ -177,10 +180,15 @@ def _find(
             tolerance = isolation_tolerance(parameters.isolate, one.noise, one.cell)
             findings.tolerance_m = tolerance
             findings[:] = isolate_all(job, listed, findings, tolerance, summed, crew, clock, tell)
+    findings.expected = parameters.priors.expected([model.name for model in library])
     findings.scans, findings.crs = [one.told for one in summed], listed.crs()
     findings.missing = [f"{one.told.path} was left out: {one.missing}" for one in summed if one.missing]
     left_out = sum(one.unaddressable for one in summed)
-    findings.notes = [*findings.missing, *dict.fromkeys(note for each in searched for note in each.notes)]
+    findings.notes = [
+        *findings.missing,
+        *findings.as_expected(),
+        *dict.fromkeys(note for each in searched for note in each.notes),
+    ]
     findings.notes += [f"{left_out} points lie too far from the rest and were left out"] if left_out else []
     x, y, z = shift_for(job.offset).tolist()
     findings.shift, findings.timings_s = (x, y, z), clock.timings()
@@ -308,9 +316,12 @@ def search_all(
         }
         return dict(zip(tiles, all_done(job.folder, crew, tasks, told), strict=True))
 
-    # As in one piece: deeper where the whole site shows nothing, not where a tile does, and most tiles do.
+    # As in one piece: deeper where the whole site shows too little, not where a tile shows nothing, as most tiles do.
     first = found(deeper=False)
-    return first if any(one.detections for one in first.values()) else found(job.parameters.search.deeper)
+    counts = Counter(one.model for one in own(first, job))
+    expected = job.parameters.priors.expected([model.name for model in models])
+    enough = counts.total() > 0 and all(counts[name] >= count for name, count in expected.items())
+    return first if enough else found(job.parameters.search.deeper)
 
 
 def typical(found: dict[Tile, Searched]) -> list[Searched]:

@@ -49,6 +49,7 @@ class Job:
     folder : the working folder, the same for all workers; the models lie in it
     cell, offset : of every grid; blocks : log2 of the blocks along a bin's edge
     memory : bytes a worker may take; jobs : its threads
+    box : (2, 3) in which points are kept, scans' frame, metres; None: everywhere
     """
 
     folder: Path
@@ -60,10 +61,11 @@ class Job:
     parameters: Parameters
     seed: int
     origin: tuple[float, float, float] | None = None
+    box: NDArray[np.float64] | None = None
 
     def grid(self) -> MomentGrid:
         """An empty one."""
-        return MomentGrid(self.cell, np.array(self.offset), self.jobs)
+        return MomentGrid(self.cell, np.array(self.offset), self.jobs, box=self.box)
 
     def models(self) -> list[Model]:
         """The models sought, in the order given."""
@@ -170,7 +172,9 @@ def search(
     deeper : see SearchParameters
     """
     models = by_size(job.models())[group]
-    own = replace(job.parameters, search=replace(job.parameters.search, max_instances=None, deeper=deeper))
+    # How many there are of the whole site says nothing of a tile.
+    limits, priors = job.parameters.search, replace(job.parameters.priors, expect=None)
+    own = replace(job.parameters, search=replace(limits, max_instances=None, deeper=deeper), priors=priors)
     grid = grid_of(job, models, tile, signed, scans)
     taken = [Standing(surface_of(job.folder, one.model, reach), one.scene_from_model) for one in standing]
     found = Sizes(models, own)
