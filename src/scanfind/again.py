@@ -59,7 +59,8 @@ def isolate_again(
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
             # Of the whole model as designed, also where the search fitted its parts one by one.
             surfaces = surfaces_of(found, models.models(), within)
-            findings = Findings(with_points(found, surfaces, {}, chunks, within, rest, available_cores()))
+            cut, _ = with_points(found, surfaces, {}, chunks, within, rest, available_cores(), within)
+            findings = Findings(cut)
         findings.refused, findings.notes = found.refused, found.notes
         findings.elements, findings.allowed_m = found.elements, found.allowed_m
         findings.alignment = found.alignment

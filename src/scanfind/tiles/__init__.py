@@ -30,6 +30,7 @@ from pydantic_core import to_jsonable_python
 from scanfind.clock import Clock, say_if_compiling
 from scanfind.cloud import shift_for
 from scanfind.detection import Findings
+from scanfind.dimensions import dimensioned
 from scanfind.errors import Interrupted, UnreadableFileError, UnsupportedFormatError, UsageError
 from scanfind.find import ModelInput, isolation_tolerance, models_of
 from scanfind.fit.polish import polished
@@ -63,6 +64,7 @@ from scanfind.tiles.tasks import (
     gathered,
     on_disk,
     own,
+    plan_in,
     search,
     sum_up,
     surface_of,
@@ -361,6 +363,10 @@ def isolate_all(
         with clock("refine"):
             surface = surface_of(job.folder, one.model, tolerance)
             fitted = polished(with_points, surface, job.parameters.refine, job.jobs)
+        with clock("measure"):
+            if fitted.isolated is not None:
+                xyz = np.asarray(fitted.isolated.xyz)
+                fitted = dimensioned(fitted, plan_in(job.folder, one.model), surface, xyz, None, tolerance, job.jobs)
         points = fitted.isolated or cut_out
         try:
             measured.append(replace(fitted, isolated=on_disk(points, job.folder / f"points-{one.id:05d}")))

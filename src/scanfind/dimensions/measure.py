@@ -1,0 +1,244 @@
+"""The dimensions of a detection as built: its features fitted to its raw points, and held against the design."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import nan, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.detection import Dimension
+from scanfind.dimensions.drawing import Wanted, wanted_of
+from scanfind.dimensions.features import PIPE, Feature, Surface, features_of
+from scanfind.dimensions.fits import Fitted, Seen, State, designed, fit
+from scanfind.dimensions.skin import across
+from scanfind.fit.patches import measured as distances_of
+from scanfind.library.near_surface import near_triangles
+from scanfind.pose import Pose, rotation_from_vector
+
+if TYPE_CHECKING:
+    from scanfind.detection import Detection
+    from scanfind.kernels.distance import NearSurface
+    from scanfind.mesh import Mesh
+
+Floats = NDArray[np.float64]
+
+REACH_M = 0.02  # a flange 6 mm off and 1° askew still has all its points within it
+REACH_SHARE = 0.01  # of a model's diameter: what lies farther from a small one is something else
+MARGIN_M = 0.005  # from the edges of a feature: a beam is as wide, and points of it are of neither side
+MARGIN_SHARE = 0.25  # of how far its middle is from its edges, at most
+LEAST_POINTS = 40
+MOST_LOOKED_AT = 100_000  # of all points, 2 µs each
+MOST_POINTS = 2_000  # of a surface: more tell nothing new against what patches disagree by
+LEAST_ARC = 6  # of 36 sectors: the radius of less than 60° of a pipe is anybody's guess
+SECTORS = 36
+STEP = 1e-6  # metres or radians, of a derivative
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is measured of a model: its features, the dimensions of them, and the faces (F, 3, 3) it was made of.
+
+    reach : how far from its surface points are wanted, metres, to see what was built off
+    """
+
+    features: tuple[Feature, ...]
+    wanted: tuple[Wanted, ...]
+    corners: Floats
+    reach: float
+
+
+def plan_of(mesh: Mesh) -> Plan:
+    """Find a model's features, and what is to be measured of them; nothing of one that is free-form."""
+    features = features_of(mesh)
+    diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    return Plan(features, tuple(wanted_of(features)), mesh.triangles(), min(REACH_M, REACH_SHARE * diameter))
+
+
+def dimensioned(
+    found: Detection, plan: Plan | None, near: NearSurface, xyz: Floats, built: Floats | None, reach: float,
+    jobs: int = 1,
+) -> Detection:  # fmt: skip
+    """A detection with its key dimensions; as it was where there is no plan.
+
+    near : the surface of its model; xyz : (N, 3) the points within `reach` of it, metres, scan frame
+    built : (F, 3, 3) its faces where its parts were built, scan frame, where they were fitted: then points are by these
+    """
+    # Without its missing parts nobody knows which face is which.
+    if plan is None or (built is not None and len(built) != len(plan.corners)):
+        return found
+    pose = found.scene_from_model
+    xyz = np.ascontiguousarray(xyz[:: -(-len(xyz) // MOST_LOOKED_AT) or 1])
+    if built is None:
+        distance, face = distances_of(near._replace(reach=reach), pose, xyz, jobs)
+    else:
+        # About a corner: far from zero single precision would round the tree of boxes.
+        corner = built[0, 0]
+        distance, face = distances_of(near_triangles(built - corner, reach), Pose(np.eye(3), corner.copy()), xyz, jobs)
+    met = np.flatnonzero(face >= 0)
+    points, face, gap = pose.inverse().move(xyz[met]), face[met], np.abs(distance[met]).astype(np.float64)
+    drawn = points if built is None else as_drawn(xyz[met], built[face], plan.corners[face])
+    seen = {
+        k: [Seen(surface, points[rows]) for surface in feature.surfaces
+            for rows in [on_surface(surface, len(plan.corners), face, drawn, gap)]]
+        for k, feature in enumerate(plan.features)
+    }  # fmt: skip
+    fits = {k: fitted(plan.features[k], some, None if built is not None else reach) for k, some in seen.items()}
+    return replace(found, dimensions=tuple(dimension(one, plan.features, fits, found) for one in plan.wanted))
+
+
+def on_surface(
+    surface: Surface, faces: int, face: NDArray[np.int32], points: Floats, distance: Floats
+) -> NDArray[np.int64]:
+    """Which of N points (N, 3), near a `face` (N,) each, are measurements of a surface: their numbers, at most so many.
+
+    faces : of the mesh in all
+    """
+    its = np.zeros(faces, np.bool_)
+    its[surface.faces] = True
+    rows = np.flatnonzero(its[face])
+    # Twice: some of the first lie at edges.
+    rows = rows[:: -(-len(rows) // (2 * MOST_POINTS)) or 1]
+    return rows[inside(surface, points[rows], distance[rows])]
+
+
+def as_drawn(points: Floats, built: Floats, design: Floats) -> Floats:
+    """Points (N, 3) moved with their nearest face from where it was built to where it is drawn, both (N, 3, 3)."""
+
+    def frames(corners: Floats) -> Floats:
+        along = corners[:, 1] - corners[:, 0]
+        normal = np.cross(along, corners[:, 2] - corners[:, 0])
+        axes = [along, np.cross(normal, along), normal]
+        return np.stack([axis / np.linalg.norm(axis, axis=1)[:, None] for axis in axes], axis=1)
+
+    local = np.einsum("nij,nj->ni", frames(built), points - built[:, 0])
+    moved: Floats = design[:, 0] + np.einsum("nij,ni->nj", frames(design), local)
+    return moved
+
+
+def inside(surface: Surface, points: Floats, distance: Floats) -> NDArray[np.bool_]:
+    """Which of N points (N, 3) are before a surface and well within its edges; `distance` (N,) from the mesh."""
+    out = points - surface.point
+    along = out @ surface.direction
+    if surface.radius is not None:
+        margin = min(MARGIN_M, MARGIN_SHARE * 0.5 * (surface.high - surface.low))
+        within: NDArray[np.bool_] = (along > surface.low + margin) & (along < surface.high - margin)
+        return within
+    # Past an edge the nearest point of the mesh is on it, and farther than the plane.
+    within = np.abs(np.abs(along) - distance) < 1e-5
+    if surface.border is None or not len(surface.border):
+        return within
+    rows = np.flatnonzero(within)
+    flat = points[rows] - np.outer(along[rows], surface.direction)
+    gap = np.full(len(rows), np.inf)
+    for start, end in surface.border:
+        edge = end - start
+        share = np.clip((flat - start) @ edge / (edge @ edge), 0.0, 1.0)
+        np.minimum(gap, np.linalg.norm(flat - start - share[:, None] * edge, axis=1), out=gap)
+    result = np.zeros(len(points), np.bool_)
+    result[rows] = gap > margin_of(surface.border, surface)
+    return result
+
+
+def margin_of(border: Floats, surface: Surface) -> float:
+    """How far from the border of a plane points count, metres."""
+    corners = border.reshape(-1, 3) - surface.point
+    u, v = across(surface.direction)
+    return min(MARGIN_M, MARGIN_SHARE * 0.5 * float(min(np.ptp(corners @ u), np.ptp(corners @ v))))
+
+
+def fitted(feature: Feature, seen: Sequence[Seen], reach: float | None) -> Fitted | str:
+    """A feature fitted to what is seen of it, or why it cannot be.
+
+    reach : metres to which points were cut out about the design; None: they were cut out where it was built
+    """
+    first, *rest = seen
+    if len(first.points) < LEAST_POINTS:
+        return f"of {feature.name} only {len(first.points)} points are seen away from its edges"
+    if feature.kind == PIPE and arc_of(first) < LEAST_ARC:
+        return f"{feature.name} is seen from one side only, over {360 // SECTORS * arc_of(first)}°"
+    kept = [first, *(each for each in rest if len(each.points) >= LEAST_POINTS and arc_of(each) >= LEAST_ARC)]
+    done = fit(feature, kept)
+    if done is None:
+        return f"what is seen of {feature.name} does not fix it"
+    if reach is not None and 3.0 * done.noise + farthest(done, kept) > reach:
+        return f"{feature.name} is farther off than points were cut out to, {1e3 * reach:.0f} mm: try --parts"
+    return done
+
+
+def arc_of(seen: Seen) -> int:
+    """In how many of SECTORS about the axis of a cylinder points are seen."""
+    off = seen.points - seen.surface.point
+    u, v = across(seen.surface.direction)
+    turn = np.arctan2(off @ v, off @ u) / (2.0 * np.pi) + 0.5
+    counts = np.bincount(np.floor(turn * SECTORS).astype(np.int64) % SECTORS, minlength=SECTORS)
+    return int((counts >= max(2, 0.002 * len(off))).sum())
+
+
+def farthest(done: Fitted, seen: Sequence[Seen]) -> float:
+    """How far the surface, where it is seen, is from the design, metres."""
+    from scanfind.dimensions.fits import residuals
+
+    drawn, _ = residuals(done.feature, seen, Pose.identity(), 0.0)
+    built, _ = residuals(done.feature, seen, done.moved, done.wider)
+    return float(np.percentile(np.abs(drawn - built), 95.0))
+
+
+def dimension(
+    wanted: Wanted, features: Sequence[Feature], fits: Mapping[int, Fitted | str], found: Detection
+) -> Dimension:
+    """A dimension as designed and as built."""
+    design = wanted.value(*(designed(features[k]) for k in wanted.of))
+    told = [fits[k] for k in wanted.of]
+    gone = next((why for why in told if isinstance(why, str)), "")
+    fitted = [one for one in told if isinstance(one, Fitted)]
+    for k in wanted.rim:
+        one = fits[k]
+        if isinstance(one, Fitted) and one.directions.shape[1] < 5:
+            gone = f"too little of the rim of {features[k].name} is seen"
+    if gone:
+        return Dimension(wanted.name, wanted.kind, design, nan, nan, gone)
+    states = [one.state() for one in fitted]
+    variance = 0.0
+    for k, one in enumerate(fitted):
+        slope = np.array(
+            [
+                slope_of(
+                    wanted,
+                    [*states[:k], one.state(step), *states[k + 1 :]],
+                    [*states[:k], one.state(-step), *states[k + 1 :]],
+                )
+                for step in STEP * np.eye(one.directions.shape[1])
+            ]
+        )
+        variance += float(slope @ one.covariance @ slope)
+    if wanted.by_pose and found.covariance is not None and found.pivot is not None:
+        slope = np.array(
+            [
+                slope_of(
+                    wanted,
+                    [moved(state, found, step) for state in states],
+                    [moved(state, found, -step) for state in states],
+                )
+                for step in STEP * np.eye(6)
+            ]
+        )
+        variance += float(slope @ found.covariance @ slope)
+    return Dimension(wanted.name, wanted.kind, design, wanted.value(*states), sqrt(max(variance, 0.0)))
+
+
+def slope_of(wanted: Wanted, after: Sequence[State], before: Sequence[State]) -> float:
+    """By how much a dimension changes with something that was changed by STEP both ways."""
+    return (wanted.value(*after) - wanted.value(*before)) / (2.0 * STEP)
+
+
+def moved(state: State, found: Detection, step: Floats) -> State:
+    """Where a feature would be in the model, were the pose another by a turn and a shift (6,) as its covariance has."""
+    pose, pivot = found.scene_from_model, np.array(found.pivot)
+    turn = rotation_from_vector(step[:3])
+    other = Pose(turn @ pose.rotation, turn @ (pose.translation - pivot) + pivot + step[3:])
+    change = other.inverse() @ pose
+    return State(change.move(state.centre[None])[0], change.turn(state.axis[None])[0], state.radius)
