@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 
 PARALLEL = cos(radians(0.5))  # as designed
 SQUARE = radians(0.5)
+COPLANAR_M = 1e-3
 ALL_PAIRS = 3  # flanges: of more, each is held against the first
 MOST_ANGLES = 4  # pipes between which angles are given
 
@@ -75,6 +76,8 @@ def between_flanges(features: Sequence[Feature], a: int, b: int) -> Iterator[Wan
     one, other = features[a], features[b]
     names = f"{one.name} – {other.name}"
     cosine = float(one.axis @ other.axis)
+    if abs(cosine) > PARALLEL and abs(float((other.centre - one.centre) @ one.axis)) < COPLANAR_M:
+        return
     if abs(cosine) > PARALLEL:
         yield Wanted(f"{names}, face to face", LINEAR, (a, b), face_to_face)
         yield Wanted(f"{names}, out of parallel", ANGLE, (a, b), out_of_parallel)

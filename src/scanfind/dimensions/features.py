@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from math import cos, radians
+from math import cos, radians, sin
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,8 +33,10 @@ LEAST_DISC_M = 0.02  # radius: below are bolts
 FREE = 0.5  # of a disc's radius: nothing of the model stands so far in front of a face that something can be bolted to
 DIRECTIONS = 64
 MOST_FLANGES, MOST_PIPES = 8, 8
-LEAST_SIDE = 0.02  # of a model's area
-SQUARE = cos(radians(0.2))
+LEAST_SIDE = 3e-4  # of a model's area: the end of a hollow column of 3.6 m is 7e-4
+PARALLEL = cos(radians(0.2))
+UPRIGHT = sin(radians(5.0))
+EXTENTS = ("length", "width", "height")
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +44,8 @@ class Surface:
     """Faces of the mesh that are of one plane (`radius` None) or one cylinder; model frame, metres.
 
     point, direction : of the plane and its outward normal, or of the axis
-    border : (B, 2, 3) where the plane's faces end; low, high : where the cylinder does, along its axis from `point`
+    border : (B, 2, 3) where the plane's faces end; width : of what is between, on average
+    low, high : where the cylinder ends, along its axis from `point`
     """
 
     faces: Ints
@@ -50,6 +53,7 @@ class Surface:
     direction: Floats
     radius: float | None = None
     border: Floats | None = None
+    width: float = 0.0
     low: float = 0.0
     high: float = 0.0
 
@@ -173,20 +177,32 @@ def is_before(other: Flat, flat: Flat, radius: float) -> bool:
 
 
 def sides_of(skin: Skin, flats: Sequence[Flat]) -> list[Feature]:
-    """Pairs of opposite outermost planes, the farthest apart first: what gives a frame or a bar its measures."""
+    """Pairs of opposite outermost planes, square to one another, farthest apart first: extents of a bar or frame."""
     least = LEAST_SIDE * float(skin.areas.sum())
     outer = [side for side in planes_of(skin, flats) if side.area > least and is_outermost(skin, side)]
     pairs = [
         (float((one.centre - other.centre) @ one.normal), one, other)
         for one, other in combinations(outer, 2)
-        if float(one.normal @ other.normal) < -SQUARE
+        if float(one.normal @ other.normal) < -PARALLEL
     ]
     pairs.sort(key=lambda pair: (-round(pair[0], 4), *np.round(pair[1].normal, 3)))
+    kept: list[tuple[float, Flat, Flat]] = []
+    for pair in pairs:
+        if all(abs(float(pair[1].normal @ other[1].normal)) < UPRIGHT for other in kept):
+            kept.append(pair)
+    # Of a bar with mitred ends its depth comes first, and is not its length.
+    names = EXTENTS if kept and kept[0][0] > 0.9 * longest(skin, [pair[1].normal for pair in kept]) else EXTENTS[1:]
     return [
         Feature(f"{what} side {number}", SIDE, side.centre, side.normal, (plane(skin, side),))
-        for what, (_, *two) in zip(("length", "width", "height"), pairs[:3], strict=False)
+        for what, (_, *two) in zip(names, kept, strict=False)
         for number, side in enumerate(two, 1)
     ]
+
+
+def longest(skin: Skin, normals: Sequence[Floats]) -> float:
+    """The largest extent along up to three directions that are square to one another, and what is square to them."""
+    square = np.linalg.svd(np.array(normals))[2][len(normals) :]
+    return float(np.ptp(skin.corners.reshape(-1, 3) @ np.concatenate([normals, square]).T, axis=0).max())
 
 
 def planes_of(skin: Skin, flats: Sequence[Flat]) -> list[Flat]:
@@ -196,7 +212,7 @@ def planes_of(skin: Skin, flats: Sequence[Flat]) -> list[Flat]:
         first = left[0]
         reach = 1e-3 * np.sqrt(first.area)
         alike = [
-            flat.normal @ first.normal > SQUARE and abs((flat.centre - first.centre) @ first.normal) < reach
+            flat.normal @ first.normal > PARALLEL and abs((flat.centre - first.centre) @ first.normal) < reach
             for flat in left
         ]
         planes.append(flat_of_all(skin, [flat for flat, same in zip(left, alike, strict=True) if same]))
@@ -219,7 +235,9 @@ def is_outermost(skin: Skin, side: Flat) -> bool:
 
 def plane(skin: Skin, flat: Flat) -> Surface:
     """A flat piece as a surface."""
-    return Surface(skin.number[flat.faces], flat.centre, flat.normal, border=flat.border)
+    around = float(np.linalg.norm(flat.border[:, 1] - flat.border[:, 0], axis=1).sum())
+    width = 2.0 * flat.area / max(around, 1e-12)
+    return Surface(skin.number[flat.faces], flat.centre, flat.normal, border=flat.border, width=width)
 
 
 def about(skin: Skin, piece: Round) -> Surface:

@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 REACH_M = 0.02  # a flange 6 mm off and 1° askew still has all its points within it
 REACH_SHARE = 0.01  # of a model's diameter: what lies farther from a small one is something else
 MARGIN_M = 0.005  # from the edges of a feature: a beam is as wide, and points of it are of neither side
-MARGIN_SHARE = 0.25  # of how far its middle is from its edges, at most
+MARGIN_SHARE = 0.25  # of its width, at most
 LEAST_POINTS = 40
 MOST_LOOKED_AT = 100_000  # of all points, 2 µs each
 MOST_POINTS = 2_000  # of a surface: more tell nothing new against what patches disagree by
@@ -124,7 +124,7 @@ def inside(surface: Surface, points: Floats, distance: Floats) -> NDArray[np.boo
     out = points - surface.point
     along = out @ surface.direction
     if surface.radius is not None:
-        margin = min(MARGIN_M, MARGIN_SHARE * 0.5 * (surface.high - surface.low))
+        margin = min(MARGIN_M, MARGIN_SHARE * (surface.high - surface.low))
         within: NDArray[np.bool_] = (along > surface.low + margin) & (along < surface.high - margin)
         return within
     # Past an edge the nearest point of the mesh is on it, and farther than the plane.
@@ -139,15 +139,8 @@ def inside(surface: Surface, points: Floats, distance: Floats) -> NDArray[np.boo
         share = np.clip((flat - start) @ edge / (edge @ edge), 0.0, 1.0)
         np.minimum(gap, np.linalg.norm(flat - start - share[:, None] * edge, axis=1), out=gap)
     result = np.zeros(len(points), np.bool_)
-    result[rows] = gap > margin_of(surface.border, surface)
+    result[rows] = gap > min(MARGIN_M, MARGIN_SHARE * surface.width)
     return result
-
-
-def margin_of(border: Floats, surface: Surface) -> float:
-    """How far from the border of a plane points count, metres."""
-    corners = border.reshape(-1, 3) - surface.point
-    u, v = across(surface.direction)
-    return min(MARGIN_M, MARGIN_SHARE * 0.5 * float(min(np.ptp(corners @ u), np.ptp(corners @ v))))
 
 
 def fitted(feature: Feature, seen: Sequence[Seen], reach: float | None) -> Fitted | str:
@@ -191,7 +184,7 @@ def dimension(
     wanted: Wanted, features: Sequence[Feature], fits: Mapping[int, Fitted | str], found: Detection
 ) -> Dimension:
     """A dimension as designed and as built."""
-    design = wanted.value(*(designed(features[k]) for k in wanted.of))
+    design = float(wanted.value(*(designed(features[k]) for k in wanted.of)))
     told = [fits[k] for k in wanted.of]
     gone = next((why for why in told if isinstance(why, str)), "")
     fitted = [one for one in told if isinstance(one, Fitted)]
@@ -227,7 +220,7 @@ def dimension(
             ]
         )
         variance += float(slope @ found.covariance @ slope)
-    return Dimension(wanted.name, wanted.kind, design, wanted.value(*states), sqrt(max(variance, 0.0)))
+    return Dimension(wanted.name, wanted.kind, design, float(wanted.value(*states)), sqrt(max(variance, 0.0)))
 
 
 def slope_of(wanted: Wanted, after: Sequence[State], before: Sequence[State]) -> float:

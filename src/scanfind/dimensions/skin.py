@@ -18,13 +18,16 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 FLAT = cos(radians(0.3))  # neighbours that differ by less are of one plane; the finest pipes have 1° a facet
+SMOOTH, ALIKE = cos(radians(16.0)), 0.3
+MOST_FLATS = 500
 BENT = cos(radians(35.0))  # neighbours on a pipe of ten sides; coarser ones are not told from bars
-LEAST_SHARE = 2e-4  # of all area, for what is looked at
+LEAST_SHARE = 1e-4  # of all area, for what is looked at
 ROUND = 2e-3  # of the radius: corners of a tessellated cylinder lie on it, but for the rounding of a file
 SECTORS = 24
 HALF_SEEN = SECTORS // 2  # less is a fillet
 ACROSS = 0.05  # sine by which a face of a cylinder may lean; those of elbows lean more
-MOST_TRIES = 300  # a millisecond each of 10,000 faces
+MOST_TRIES = 200  # a millisecond each of 10,000 faces
+LEAST_FACES = 8
 
 
 class Skin(NamedTuple):
@@ -86,14 +89,25 @@ def flats_of(skin: Skin) -> list[Flat]:
     """The flat pieces, the largest first."""
     if not len(skin.areas):
         return []
-    cosine = (skin.normals[skin.pairs[:, 0]] * skin.normals[skin.pairs[:, 1]]).sum(axis=1)
-    piece = connected(len(skin.areas), skin.pairs[cosine > FLAT])
+    first, second = skin.pairs.T
+    cosine = (skin.normals[first] * skin.normals[second]).sum(axis=1)
+    piece = np.unique(connected(len(skin.areas), skin.pairs[cosine > FLAT]), return_inverse=True)[1]
     areas = np.bincount(piece, skin.areas)
-    found = []
+    # A facet of something curved: two or more neighbours of about its size go on from it smoothly.
+    smooth = skin.pairs[(cosine <= FLAT) & (cosine > SMOOTH)]
+    beside = np.unique(piece[np.concatenate([smooth, smooth[:, ::-1]])], axis=0)
+    beside = beside[areas[beside[:, 1]] > ALIKE * areas[beside[:, 0]]]
+    curved = np.bincount(beside[:, 0], minlength=len(areas)) > 1
+    order = np.argsort(piece, kind="stable")
+    counts = np.bincount(piece)
+    ends = np.cumsum(counts)
+    found: list[Flat] = []
     for k in np.argsort(-areas, kind="stable"):
-        if areas[k] < LEAST_SHARE * areas.sum():
+        if areas[k] < LEAST_SHARE * areas.sum() or len(found) >= MOST_FLATS:
             break
-        flat = flat_of(skin, np.flatnonzero(piece == k))
+        if curved[k]:
+            continue
+        flat = flat_of(skin, order[ends[k] - counts[k] : ends[k]])
         off = (skin.corners[flat.faces] - flat.centre) @ flat.normal
         if np.abs(off).max() < ROUND * np.sqrt(flat.area):
             found.append(flat)
@@ -119,7 +133,7 @@ def rounds_of(skin: Skin) -> list[Round]:
     first, second = skin.pairs.T
     cosine = (skin.normals[first] * skin.normals[second]).sum(axis=1)
     size = np.minimum(skin.areas[first], skin.areas[second])
-    likely = (cosine < FLAT) & (cosine > BENT) & (size > 0.1 * LEAST_SHARE * skin.areas.sum())
+    likely = (cosine < FLAT) & (cosine > BENT) & (size > 0.2 * LEAST_SHARE * skin.areas.sum())
     likely_first = np.flatnonzero(likely)[np.argsort(-size[likely], kind="stable")]
     extent = float(np.ptp(skin.corners.reshape(-1, 3), axis=0).max()) if len(skin.areas) else 0.0
     used = np.zeros(len(skin.areas), np.bool_)
@@ -133,11 +147,10 @@ def rounds_of(skin: Skin) -> list[Round]:
         if not 0.0 < radius < extent:
             continue
         faces = on_cylinder(skin, ~used, centre, axis, radius)
-        for run in runs_of(skin, faces, centre, axis, radius):
-            # Also what is no whole cylinder is not looked at again.
-            used[run.faces] = True
-            if is_round(skin, run):
-                found.append(run)
+        # Also what is no whole cylinder is not looked at again.
+        used[faces] = True
+        if len(faces) >= LEAST_FACES:
+            found += [run for run in runs_of(skin, faces, centre, axis, radius) if is_round(skin, run)]
     return found
 
 
@@ -172,8 +185,6 @@ def on_cylinder(skin: Skin, free: NDArray[np.bool_], centre: Floats, axis: Float
 
 def runs_of(skin: Skin, faces: Ints, centre: Floats, axis: Floats, radius: float) -> list[Round]:
     """The faces of one cylinder, cut where there is a gap in it longer than what is on either side of the gap."""
-    if not len(faces):
-        return []
     along = (skin.corners[faces] - centre) @ axis
     low, high = along.min(axis=1), along.max(axis=1)
     order = np.argsort(low, kind="stable")
@@ -215,7 +226,7 @@ def is_round(skin: Skin, piece: Round) -> bool:
     # A coarse tube has fewer faces than sectors.
     around = len(sectors) >= min(HALF_SEEN, len(np.unique(np.round(skin.normals[piece.faces], 2), axis=0)))
     whole = 4.0 * np.pi * piece.radius * piece.half
-    return bool(around and skin.areas[piece.faces].sum() > 0.25 * whole and len(piece.faces) >= 8)
+    return bool(around and skin.areas[piece.faces].sum() > 0.25 * whole and len(piece.faces) >= LEAST_FACES)
 
 
 def across(axis: Floats) -> tuple[Floats, Floats]:
