@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from by_hand import detection, folder_by_hand, results
 from scanfind.cloud import PointChunk
-from scanfind.detection import FACE, LINEAR, PLACE, RADIUS, Detection, Dimension, Findings
+from scanfind.detection import FACE, LINEAR, PLACE, RADIUS, Detection, Dimension, Findings, IsolatedPoints
 from scanfind.dimensions import Feature, Plan, dimensioned, plan_of
 from scanfind.dimensions.fits import designed
 from scanfind.isolation.isolate import IsolateParameters, Placed, isolate, nearer
@@ -72,7 +72,9 @@ def at(pose: Pose) -> Detection:
 def measured(mesh: Mesh, xyz: Floats, pose: Pose | None = None, reach: float = REACH) -> dict[str, Dimension]:
     pose = pose or Pose.identity()
     plan, near = known(mesh, reach)
-    return {one.name: one for one in dimensioned(at(pose), plan, near, xyz, None, reach).dimensions}
+    nobody = np.zeros(len(xyz), np.int32)
+    cut = IsolatedPoints(xyz, {}, nobody, nobody.astype(np.int64), np.zeros(len(xyz), np.float32))
+    return {one.name: one for one in dimensioned(at(pose), plan, near, cut, [None], reach).dimensions}
 
 
 def on_features(
@@ -214,7 +216,7 @@ def test_dimensions_stay_when_scan_and_pose_move_together() -> None:
 def test_sigma_is_what_the_error_is(shared: float) -> None:
     """Independent noise of points, and noise that all points of 6 cm share, which only shows between patches."""
     errors: dict[str, list[float]] = {}
-    for seed in range(40):
+    for seed in range(24):
         rng = np.random.default_rng(seed)
         xyz = on_features(LEG, rng, as_designed, 500)
         cube = np.floor(xyz / 0.06).astype(int) % 64
@@ -224,7 +226,7 @@ def test_sigma_is_what_the_error_is(shared: float) -> None:
             if one.kind in {LINEAR, RADIUS} or "angle" in name:
                 errors.setdefault(name, []).append((one.built - one.design) / one.sigma)
     squares = {name: float(np.mean(np.square(values))) for name, values in errors.items()}
-    # 40 draws: the mean of their squares is within 0.45 to 1.7 in 99 %; of all of them together within 0.8 to 1.25.
+    # 24 draws: the mean of their squares is within 0.4 to 1.9 in 99 %; of all of them together within 0.7 to 1.3.
     assert all(0.35 < square < 2.0 for square in squares.values()), squares
     assert 0.7 < float(np.mean(list(squares.values()))) < 1.3, squares
 
@@ -235,7 +237,7 @@ def test_a_scanned_leg_built_off_is_measured() -> None:
     pose = Pose(random_rotation(rng), np.array([0.0, 0.0, 1.2]))
     built = SceneObject("built", leg(1.206, radians(1.0)), pose, target=True)
     stations = np.array([[3.0, 1.0, 1.5], [-3.0, 1.0, 2.0], [0.0, 4.0, 1.0], [0.5, -3.5, 2.2]])
-    scanned = scan(Scene((built,), stations), scanner=Scanner(step=0.003), seed=3)
+    scanned = scan(Scene((built,), stations), scanner=Scanner(step=0.004), seed=3)
     told = measured(LEG, np.concatenate([station.xyz for station in scanned.stations]), pose)
     long = told["flange 1 face – flange 2 centre"]
     assert abs(long.built - 1.541) < 4.0 * long.sigma < 0.003

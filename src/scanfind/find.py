@@ -34,7 +34,7 @@ from scanfind.scans.sources import Scan, Sources, require_points
 from scanfind.threads import available_cores
 
 if TYPE_CHECKING:
-    from scanfind.detection import Detection
+    from scanfind.detection import Detection, IsolatedPoints
     from scanfind.kernels.distance import NearSurface
     from scanfind.progress import Progress
     from scanfind.recognition.recognise import Standing
@@ -106,8 +106,8 @@ def find(
     findings.refused = found.refused()
     if isolate and (parts := found.built()):
         with clock("isolate"):  # each part by its own raw points, in a pass of its own: where they are decides 3.5
-            around = near_parts(parts, watched(sources.chunks(), clock, tell, "isolate", sources.expected()), jobs)
-            findings[:] = [found.measured(one, around.get(one.id)) for one in findings]
+            beside = near_parts(parts, watched(sources.chunks(), clock, tell, "isolate", sources.expected()), jobs)
+            findings[:] = [found.measured(one, beside.get(one.id)) for one in findings]
     if isolate and (findings or remainder is not None):
         with clock("isolate"):  # 3.5 isolation: the second pass
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
@@ -122,8 +122,11 @@ def find(
                 one if one.parts else polished(one, surfaces[one.model], parameters.refine, jobs) for one in findings
             ]
         with clock("measure"):  # what a drawing would dimension, as built
+            stations = [place for source in sources.all for place in source.told().stations]
             findings[:] = [
-                dimensioned(one, plans.get(one.model), surfaces[one.model], around[one.id], built.get(one.id), reach)
+                dimensioned(one, plan, surfaces[one.model], around[one.id], stations, reach, built.get(one.id))
+                if (plan := plans.get(one.model))
+                else one
                 for one in findings
             ]
     if at_design:
@@ -230,8 +233,8 @@ def plans_of(findings: Sequence[Detection], library: Sequence[Model]) -> dict[st
 def with_points(
     findings: Sequence[Detection], surfaces: Mapping[str, NearSurface], built: Mapping[int, Floats],
     chunks: Iterable[PointChunk], tolerance: float, remainder: CloudWriter | None, jobs: int, reach: float,
-) -> tuple[list[Detection], dict[int, Floats]]:  # fmt: skip
-    """Each detection with its raw points and how far they are from its model; by id, all points (N, 3) within `reach`.
+) -> tuple[list[Detection], dict[int, IsolatedPoints]]:  # fmt: skip
+    """Each detection with its raw points and how far they are from its model; by id, all points within `reach`.
 
     built : by id, the faces (F, 3, 3), scan frame, of those fitted in parts: what their points are cut and measured by
     """
@@ -247,7 +250,7 @@ def with_points(
         found.with_points(cut := nearer(points[found.id], tolerance), deviation_of(cut.deviation) if len(cut) else None)
         for found in findings
     ]
-    return told, {number: cut.xyz for number, cut in points.items()}
+    return told, points
 
 
 def near_parts(built: Mapping[int, Floats], chunks: Iterable[PointChunk], jobs: int) -> dict[int, Floats]:

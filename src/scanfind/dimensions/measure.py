@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import nan, sqrt
-from typing import TYPE_CHECKING
+from math import cos, nan, radians, sqrt
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from scanfind.library.near_surface import near_triangles
 from scanfind.pose import Pose, rotation_from_vector
 
 if TYPE_CHECKING:
-    from scanfind.detection import Detection
+    from scanfind.detection import Detection, IsolatedPoints
     from scanfind.kernels.distance import NearSurface
     from scanfind.mesh import Mesh
 
@@ -30,6 +30,8 @@ REACH_M = 0.02  # a flange 6 mm off and 1° askew still has all its points withi
 REACH_SHARE = 0.01  # of a model's diameter: what lies farther from a small one is something else
 MARGIN_M = 0.005  # from the edges of a feature: a beam is as wide, and points of it are of neither side
 MARGIN_SHARE = 0.25  # of its width, at most
+# Beams that graze a surface hit what is behind it with part of their width: the silhouette of a pipe looks thicker.
+GRAZING = cos(radians(72.0))
 LEAST_POINTS = 40
 MOST_LOOKED_AT = 100_000  # of all points, 2 µs each
 MOST_POINTS = 2_000  # of a surface: more tell nothing new against what patches disagree by
@@ -59,19 +61,20 @@ def plan_of(mesh: Mesh) -> Plan:
 
 
 def dimensioned(
-    found: Detection, plan: Plan | None, near: NearSurface, xyz: Floats, built: Floats | None, reach: float,
-    jobs: int = 1,
+    found: Detection, plan: Plan, near: NearSurface, cut: IsolatedPoints,
+    stations: Sequence[tuple[float, float, float] | None], reach: float, built: Floats | None = None, jobs: int = 1,
 ) -> Detection:  # fmt: skip
-    """A detection with its key dimensions; as it was where there is no plan.
+    """A detection with its key dimensions.
 
-    near : the surface of its model; xyz : (N, 3) the points within `reach` of it, metres, scan frame
+    near : the surface of its model; cut : the points within `reach` of it, metres
+    stations : where scanners stood, by the points' scan_id; None where nobody knows
     built : (F, 3, 3) its faces where its parts were built, scan frame, where they were fitted: then points are by these
     """
     # Without its missing parts nobody knows which face is which.
-    if plan is None or (built is not None and len(built) != len(plan.corners)):
+    if built is not None and len(built) != len(plan.corners):
         return found
-    pose = found.scene_from_model
-    xyz = np.ascontiguousarray(xyz[:: -(-len(xyz) // MOST_LOOKED_AT) or 1])
+    pose, some = found.scene_from_model, slice(None, None, -(-len(cut) // MOST_LOOKED_AT) or 1)
+    xyz = np.ascontiguousarray(cut.xyz[some])
     if built is None:
         distance, face = distances_of(near._replace(reach=reach), pose, xyz, jobs)
     else:
@@ -79,30 +82,61 @@ def dimensioned(
         corner = built[0, 0]
         distance, face = distances_of(near_triangles(built - corner, reach), Pose(np.eye(3), corner.copy()), xyz, jobs)
     met = np.flatnonzero(face >= 0)
-    points, face, gap = pose.inverse().move(xyz[met]), face[met], np.abs(distance[met]).astype(np.float64)
-    drawn = points if built is None else as_drawn(xyz[met], built[face], plan.corners[face])
-    seen = {
-        k: [Seen(surface, points[rows]) for surface in feature.surfaces
-            for rows in [on_surface(surface, len(plan.corners), face, drawn, gap)]]
-        for k, feature in enumerate(plan.features)
-    }  # fmt: skip
-    fits = {k: fitted(plan.features[k], some, None if built is not None else reach) for k, some in seen.items()}
+    points, face = pose.inverse().move(xyz[met]), face[met]
+    on = Touching(
+        points if built is None else as_drawn(xyz[met], built[face], plan.corners[face]),
+        face,
+        np.abs(distance[met]).astype(np.float64),
+        pose.inverse().turn(beams(xyz[met], cut.scan_id[some][met], stations)),
+    )
+    fits = {}
+    for k, feature in enumerate(plan.features):
+        seen = [Seen(surface, points[measuring(surface, len(plan.corners), on)]) for surface in feature.surfaces]
+        fits[k] = fitted(feature, seen, None if built is not None else reach)
     return replace(found, dimensions=tuple(dimension(one, plan.features, fits, found) for one in plan.wanted))
 
 
-def on_surface(
-    surface: Surface, faces: int, face: NDArray[np.int32], points: Floats, distance: Floats
-) -> NDArray[np.int64]:
-    """Which of N points (N, 3), near a `face` (N,) each, are measurements of a surface: their numbers, at most so many.
+class Touching(NamedTuple):
+    """N points near faces of the model, all in its own frame, metres.
+
+    points : (N, 3); face : (N,) the nearest; distance : (N,) from it
+    beams : (N, 3) unit directions to the scanner, NaN where nobody knows
+    """
+
+    points: Floats
+    face: NDArray[np.int32]
+    distance: Floats
+    beams: Floats
+
+
+def beams(xyz: Floats, scan_id: NDArray[np.int32], stations: Sequence[tuple[float, float, float] | None]) -> Floats:
+    """The unit direction from each of N points (N, 3) to its scanner, (N, 3), NaN where nobody knows that."""
+    nowhere = (np.nan,) * 3
+    known = np.array([station or nowhere for station in stations] or [nowhere])
+    way = known[scan_id] - xyz if len(known) > scan_id.max(initial=0) else np.full_like(xyz, np.nan)
+    unit: Floats = way / np.linalg.norm(way, axis=1)[:, None]
+    return unit
+
+
+def measuring(surface: Surface, faces: int, on: Touching) -> NDArray[np.int64]:
+    """Which points are measurements of a surface: on it, away from its edges, hit by no grazing beam. Their numbers.
 
     faces : of the mesh in all
     """
     its = np.zeros(faces, np.bool_)
     its[surface.faces] = True
-    rows = np.flatnonzero(its[face])
+    rows = np.flatnonzero(its[on.face])
     # Twice: some of the first lie at edges.
     rows = rows[:: -(-len(rows) // (2 * MOST_POINTS)) or 1]
-    return rows[inside(surface, points[rows], distance[rows])]
+    points = on.points[rows]
+    normals = np.broadcast_to(surface.direction, points.shape)
+    if surface.radius is not None:
+        out = points - surface.point
+        out = out - np.outer(out @ surface.direction, surface.direction)
+        normals = out / np.maximum(np.linalg.norm(out, axis=1), 1e-12)[:, None]
+    grazing = (normals * on.beams[rows]).sum(axis=1) < GRAZING
+    kept: NDArray[np.int64] = rows[inside(surface, points, on.distance[rows]) & ~grazing]
+    return kept
 
 
 def as_drawn(points: Floats, built: Floats, design: Floats) -> Floats:

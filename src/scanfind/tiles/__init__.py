@@ -356,6 +356,7 @@ def isolate_all(
         tell("isolate", done, expected)
 
     cuts = list(zip([job.folder / name for name in tasks], all_done(job.folder, crew, tasks, told), strict=True))
+    stations = [place for one in summed for place in one.told.stations]
     measured = []
     for one in findings:
         cut_out = gathered(cuts, one.id)
@@ -364,9 +365,8 @@ def isolate_all(
             surface = surface_of(job.folder, one.model, tolerance)
             fitted = polished(with_points, surface, job.parameters.refine, job.jobs)
         with clock("measure"):
-            if fitted.isolated is not None:
-                xyz = np.asarray(fitted.isolated.xyz)
-                fitted = dimensioned(fitted, plan_in(job.folder, one.model), surface, xyz, None, tolerance, job.jobs)
+            if (plan := plan_in(job.folder, one.model)) and fitted.isolated is not None:
+                fitted = dimensioned(fitted, plan, surface, fitted.isolated, stations, tolerance, jobs=job.jobs)
         points = fitted.isolated or cut_out
         try:
             measured.append(replace(fitted, isolated=on_disk(points, job.folder / f"points-{one.id:05d}")))

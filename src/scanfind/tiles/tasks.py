@@ -132,9 +132,10 @@ def surface_of(folder: Path, name: str, reach: float) -> NearSurface:
 
 @lru_cache(maxsize=256)
 def plan_in(folder: Path, name: str) -> Plan | None:
-    """What is to be measured of a model; None of a piece of scan."""
+    """What is to be measured of a model; None where there is nothing."""
     mesh = next(model for model in models_in(folder) if model.name == name).mesh
-    return None if mesh is None else plan_of(mesh)
+    plan = None if mesh is None else plan_of(mesh)
+    return plan if plan and plan.wanted else None
 
 
 def sum_up(folder: Path, job: Job, scan: Scan, number: int) -> Summed:
