@@ -4,7 +4,7 @@ they are; what is not seen is not measured."""
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -25,6 +25,7 @@ from scanfind.kernels.distance import NearSurface
 from scanfind.library.near_surface import near_triangles
 from scanfind.mesh import Mesh
 from scanfind.models import read_models
+from scanfind.models.parts import Part, join
 from scanfind.pose import Pose, random_rotation
 from scanfind.report import write_report
 from scanfind.results import read_results
@@ -35,6 +36,7 @@ from scanfind.simulate.objects import RIGHT_ANGLE, Route, box_frame, pipe_spool
 from scanfind.simulate.parts import assemble, hollow_section
 from scanfind.simulate.scanner import Scanner, scan
 from scanfind.simulate.scene import Scene, SceneObject
+from scanfind.simulate.steel import hollow_beam
 from scanfind.tolerances import IN, NOT_JUDGED, OUT, judge_detection
 from scanfind.tolerances.profile import profile_of
 
@@ -214,12 +216,12 @@ def test_dimensions_stay_when_scan_and_pose_move_together() -> None:
 
 @pytest.mark.parametrize("shared", [0.0, 0.001], ids=["every point its own", "patches share"])
 def test_sigma_is_what_the_error_is(shared: float) -> None:
-    """Independent noise of points, and noise that all points of 6 cm share, which only shows between patches."""
+    """Independent noise of points, and noise that all points of 4 cm share, which only shows between patches."""
     errors: dict[str, list[float]] = {}
     for seed in range(24):
         rng = np.random.default_rng(seed)
         xyz = on_features(LEG, rng, as_designed, 500)
-        cube = np.floor(xyz / 0.06).astype(int) % 64
+        cube = np.floor(xyz / 0.04).astype(int) % 64
         common = rng.normal(0.0, shared, (64, 64, 64, 3))[tuple(cube.T)]
         xyz = xyz + rng.normal(0.0, 0.0015, xyz.shape) + common
         for name, one in measured(LEG, xyz).items():
@@ -240,9 +242,9 @@ def test_a_scanned_leg_built_off_is_measured() -> None:
     scanned = scan(Scene((built,), stations), scanner=Scanner(step=0.004), seed=3)
     told = measured(LEG, np.concatenate([station.xyz for station in scanned.stations]), pose)
     long = told["flange 1 face – flange 2 centre"]
-    assert abs(long.built - 1.541) < 4.0 * long.sigma < 0.003
+    assert abs(long.built - 1.541) < 4.0 * long.sigma < 0.005
     tilt = told["flange 2 face, tilt across its diameter"]
-    assert abs(tilt.built - 0.34 * radians(1.0)) < 4.0 * tilt.sigma < 0.003
+    assert abs(tilt.built - 0.34 * radians(1.0)) < 4.0 * tilt.sigma < 0.005
     # A pipe of 48 facets is 0.14 mm thinner, on average, than the circle through its corners.
     assert told["pipe 1 radius"].built == pytest.approx(0.09986, abs=1e-4)
 
@@ -367,6 +369,42 @@ def test_reports_show_them_in_every_format(tmp_path: Path) -> None:
     cells = list(sheet.iter_rows(values_only=True))
     assert cells[0][2:8] == ("dimension", "unit", "design", "built", "difference", "sigma")
     assert cells[1][2:8] == ("flange 1 – flange 2, face to face", "mm", 1500, 1506.1, pytest.approx(6.1), 0.2)
+
+
+BARS: dict[str, tuple[Sequence[float], Sequence[float]]] = {
+    "post": ([0, 0, 0], [0, 0, 1.2]),
+    "foot": ([0.05, 0, 0.05], [0.8, 0, 0.05]),
+    "arm": ([0.05, 0, 1.1], [0.9, 0, 1.1]),
+}
+
+
+def frame(bars: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> Mesh:
+    placed = [(name, *hollow_beam(start, end, 0.1)) for name, (start, end) in bars.items()]
+    return join("frame", [Part(name, pose.move(mesh.vertices), mesh.faces) for name, mesh, pose in placed], "")
+
+
+def on_faces(mesh: Mesh, rng: np.random.Generator) -> Floats:
+    """Points all over the part of a frame's surface that is no part's inside another."""
+    corners = mesh.triangles()
+    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    face = rng.choice(len(corners), 20_000, p=doubled / doubled.sum())
+    a, b = np.sqrt(rng.random(len(face))), rng.random(len(face))
+    points: Floats = np.einsum("nk,nkj->nj", np.stack([1 - a, a * (1 - b), a * b], axis=1), corners[face])
+    return points
+
+
+def test_the_members_of_a_frame_have_lengths_and_the_corners_they_make() -> None:
+    design = frame(BARS)
+    told = said(plan_of(design))
+    assert [told[f"{name} length"] for name in ("post", "foot", "arm")] == pytest.approx([1200.0, 750.0, 850.0])
+    assert told["post – arm, angle"] == told["post – foot, angle"] == pytest.approx(90.0)
+    askew = frame(BARS | {"arm": ([0.05, 0, 1.1], [0.9, 0, 1.1 + 0.85 * np.tan(radians(0.5))])})
+    rng = np.random.default_rng(11)
+    points = on_faces(askew, rng)
+    seen = measured(design, points + rng.normal(0.0, 0.001, points.shape))
+    corner = seen["post – arm, angle"]
+    assert abs(corner.built - radians(89.5)) < 4.0 * corner.sigma < radians(0.2)
+    assert abs(seen["post – foot, angle"].built - radians(90.0)) < 4.0 * seen["post – foot, angle"].sigma
 
 
 def test_names_are_told_apart() -> None:

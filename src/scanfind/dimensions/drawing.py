@@ -103,7 +103,9 @@ def between_sides(features: Sequence[Feature], sides: Sequence[int]) -> Iterator
     """The extents between opposite sides, and how square these are to one another."""
     pairs = [(a, b) for a, b in zip(sides[::2], sides[1::2], strict=True)]
     for a, b in pairs:
-        yield Wanted(features[a].name.partition(" side")[0], LINEAR, (a, b), face_to_face)
+        # From the larger one: the other may be the end of a single bar, and askew.
+        datum, other = sorted((a, b), key=lambda k: -features[k].surfaces[0].width)
+        yield Wanted(features[a].name.partition(" side")[0], LINEAR, (datum, other), face_to_centre)
     for (a, _), (b, _) in combinations(pairs, 2):
         what = f"{features[a].name} – {features[b].name}"
         yield Wanted(f"{what}, angle", ANGLE, (a, b), angle)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-PIPE, FLANGE, SIDE = "pipe", "flange", "side"
+PIPE, FLANGE, SIDE, BAR = "pipe", "flange", "side", "bar"
 
 LONG = 1.0  # half a pipe's length over its radius: what is shorter is a rim or a coupling, and tells no axis
 COAXIAL = cos(radians(1.0))
@@ -60,11 +60,12 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Feature:
-    """A pipe, a flange or a side: a centre and a unit axis, model frame, metres, and its surfaces.
+    """A pipe, a flange, a side or a bar: a centre and a unit axis, model frame, metres, and its surfaces.
 
-    axis : of a pipe; the outward normal of a flange's face or of a side
-    radius : of a pipe, or of a flange's face; half : half the length of a pipe
-    surfaces : the cylinder of a pipe; the face of a flange, and its rim where it has one; the plane of a side
+    axis : of a pipe or bar; the outward normal of a flange's face or of a side
+    radius : of a pipe, or of a flange's face; half : half the length of a pipe or bar
+    surfaces : the cylinder of a pipe; the face of a flange, and its rim where it has one; the plane of a side; the four
+        sides of a bar
     """
 
     name: str

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.dimensions.features import BAR, PIPE
 from scanfind.dimensions.skin import across
 from scanfind.pose import Pose, rotation_from_vector
 
@@ -25,7 +26,7 @@ STEPS = 20
 STILL = 1e-9  # metres: no step is worth less
 TUKEY = 4.685  # 95 % as efficient as least squares on clean points
 MEDIAN = 1.4826  # times the median of absolute values is a standard deviation
-PATCHES = 10  # along the diagonal of what is seen
+PATCHES = 8  # along the diagonal of what is seen
 LEAST_PATCHES = 8
 LEAST_NOISE = 1e-6  # metres: exact points still have a rounding
 
@@ -83,9 +84,12 @@ def directions_of(feature: Feature, *, rim: bool) -> Floats:
     rim : is a cylinder about its axis seen?
     """
     u, v = across(feature.axis)
+    if feature.kind == BAR:  # all but a slide along itself: its sides are seen or not, but they are of one piece
+        return np.stack([np.r_[way, np.zeros(4)] for way in (u, v, feature.axis)]
+                        + [np.r_[np.zeros(3), way, 0.0] for way in (u, v)], axis=1)  # fmt: skip
     turns = [np.r_[u, np.zeros(4)], np.r_[v, np.zeros(4)]]
     aside = [np.r_[np.zeros(3), u, 0.0], np.r_[np.zeros(3), v, 0.0], np.r_[np.zeros(6), 1.0]] if rim else []
-    along = [np.r_[np.zeros(3), feature.axis, 0.0]] if feature.kind != "pipe" else []
+    along = [np.r_[np.zeros(3), feature.axis, 0.0]] if feature.kind != PIPE else []
     return np.stack([*turns, *aside, *along], axis=1)
 
 
@@ -102,8 +106,8 @@ def fit(feature: Feature, seen: Sequence[Seen]) -> Fitted | None:
         return None
     moved, wider = Pose.identity(), 0.0
     off, rows = residuals(feature, seen, moved, wider)
-    # From where the design is, not about their middle: the whole feature may be off by many times the noise.
-    noise = max(MEDIAN * float(np.median(np.abs(off))), LEAST_NOISE)
+    surface = np.repeat(np.arange(len(seen)), [len(each.points) for each in seen])
+    noise = noise_of(off, surface)
     for _ in range(STEPS):
         weight = tukey(off, noise)
         j = rows @ directions
@@ -118,11 +122,13 @@ def fit(feature: Feature, seen: Sequence[Seen]) -> Fitted | None:
         moved = moved @ Pose(turn, c - turn @ c + motion[3:6])
         wider += float(motion[6])
         off, rows = residuals(feature, seen, moved, wider)
-        before, noise = noise, max(MEDIAN * float(np.median(np.abs(off))), LEAST_NOISE)
-        if np.abs(step).max() < STILL and abs(before - noise) < STILL:
+        before, noise = noise, noise_of(off, surface)
+        if np.abs(step).max() < STILL and np.abs(before - noise).max() < STILL:
             break
     covariance = covariance_of(rows @ directions, off, noise, patch)
-    return None if covariance is None else Fitted(feature, moved, wider, directions, covariance, noise)
+    return (
+        None if covariance is None else Fitted(feature, moved, wider, directions, covariance, float(np.median(noise)))
+    )
 
 
 def residuals(feature: Feature, seen: Sequence[Seen], moved: Pose, wider: float) -> tuple[Floats, Floats]:
@@ -146,15 +152,25 @@ def residuals(feature: Feature, seen: Sequence[Seen], moved: Pose, wider: float)
     return np.concatenate(offs), np.concatenate(rows)
 
 
-def tukey(off: Floats, noise: float) -> Floats:
+def noise_of(off: Floats, surface: NDArray[np.int64]) -> Floats:
+    """The spread of each point's surface, (N,), from zero, not from the middle of its residuals.
+
+    A feature may be off by many times the noise, and of a tilted bar two sides are off and two are not: were it that of
+    all points together, those would count for nothing.
+    """
+    spread = [MEDIAN * float(np.median(np.abs(off[surface == k]))) for k in range(int(surface.max()) + 1)]
+    return np.maximum(spread, LEAST_NOISE)[surface]
+
+
+def tukey(off: Floats, noise: Floats) -> Floats:
     """Tukey's weights (N,) of residuals."""
     return np.maximum(1.0 - (off / (TUKEY * noise)) ** 2, 0.0) ** 2
 
 
-def covariance_of(j: Floats, off: Floats, noise: float, patch: NDArray[np.int64]) -> Floats | None:
+def covariance_of(j: Floats, off: Floats, noise: Floats, patch: NDArray[np.int64]) -> Floats | None:
     """The covariance (K, K) of what was fitted (Huber 1981, 7.6), widened by what patches disagree by.
 
-    j : (N, K) derivatives of the residuals off (N,); patch : (N,) which patch each is in
+    j : (N, K) derivatives of the residuals off (N,); noise : (N,) of each point; patch : (N,) which patch each is in
     None where the points leave a direction open.
     """
     share = (off / (TUKEY * noise)) ** 2
@@ -181,7 +197,7 @@ def covariance_of(j: Floats, off: Floats, noise: float, patch: NDArray[np.int64]
 
 
 def patches_of(points: Floats) -> NDArray[np.int64]:
-    """Which patch each of N points (N, 3) is in, (N,): cubes, a tenth of the diagonal of all."""
+    """Which patch each of N points (N, 3) is in, (N,): cubes, an eighth of the diagonal of all."""
     low, high = points.min(axis=0), points.max(axis=0)
     edge = max(float(np.linalg.norm(high - low)) / PATCHES, 1e-9)
     cube = np.floor((points - low) / edge).astype(np.int64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from math import cos, nan, radians, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 
 from scanfind.detection import Dimension
 from scanfind.dimensions.drawing import Wanted, wanted_of
-from scanfind.dimensions.features import PIPE, Feature, Surface, features_of
+from scanfind.dimensions.features import BAR, PIPE, SIDE, Feature, Surface, features_of
 from scanfind.dimensions.fits import Fitted, Seen, State, designed, fit
+from scanfind.dimensions.members import features_and_wanted, members_of
 from scanfind.dimensions.skin import across
 from scanfind.fit.patches import measured as distances_of
 from scanfind.library.near_surface import near_triangles
@@ -56,8 +58,12 @@ class Plan:
 def plan_of(mesh: Mesh) -> Plan:
     """Find a model's features, and what is to be measured of them; nothing of one that is free-form."""
     features = features_of(mesh)
+    wanted = wanted_of(features)
+    if all(feature.kind == SIDE for feature in features):
+        bars, more = features_and_wanted(members_of(mesh), len(features))
+        features, wanted = (*features, *bars), [*wanted, *more]
     diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    return Plan(features, tuple(wanted_of(features)), mesh.triangles(), min(REACH_M, REACH_SHARE * diameter))
+    return Plan(features, tuple(wanted), mesh.triangles(), min(REACH_M, REACH_SHARE * diameter))
 
 
 def dimensioned(
@@ -182,6 +188,11 @@ def fitted(feature: Feature, seen: Sequence[Seen], reach: float | None) -> Fitte
 
     reach : metres to which points were cut out about the design; None: they were cut out where it was built
     """
+    if feature.kind == BAR:
+        sides = [each for each in seen if len(each.points) >= LEAST_POINTS]
+        square = any(abs(float(a.surface.direction @ b.surface.direction)) < 0.5 for a, b in combinations(sides, 2))
+        done = fit(feature, sides) if square else None
+        return done or f"of {feature.name} no two sides are seen that stand square to one another"
     first, *rest = seen
     if len(first.points) < LEAST_POINTS:
         return f"of {feature.name} only {len(first.points)} points are seen away from its edges"
