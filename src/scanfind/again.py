@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 from scanfind.clock import Clock, say_if_compiling, watched
 from scanfind.detection import Findings
+from scanfind.dimensions import dimensioned
 from scanfind.errors import UsageError
-from scanfind.find import surfaces_of, with_points
+from scanfind.find import plans_of, surfaces_of, with_points
 from scanfind.library import ModelLibrary
 from scanfind.results import MODELS, fill_folder, open_remainder, read_results, result_folder, schema
 from scanfind.results.document import findings_of
@@ -58,16 +59,28 @@ def isolate_again(
             say_if_compiling(tell)
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
             # Of the whole model as designed, also where the search fitted its parts one by one.
-            surfaces = surfaces_of(found, models.models(), within)
-            findings = Findings(with_points(found, surfaces, {}, chunks, within, rest, available_cores()))
+            surfaces, plans = surfaces_of(found, models.models(), within), plans_of(found, models.models())
+            reach = max([within, *(plan.reach for plan in plans.values())])
+            cut, around = with_points(found, surfaces, {}, chunks, within, rest, available_cores(), reach)
+        # Where the scanner stood may have been told to the search by hand.
+        stood = {scan.path: scan.stations for scan in found.scans}
+        scanned = [source.told() for source in sources.all]
+        seen = [replace(scan, stations=stood.get(scan.path, scan.stations)) for scan in scanned]
+        stations = [place for scan in seen for place in scan.stations]
+        with clock("measure"):
+            # Where the parts were fitted one by one, the search measured them where they were built.
+            told = [
+                dimensioned(one, plan, surfaces[one.model], around[one.id], stations, reach)
+                if not one.parts and (plan := plans.get(one.model))
+                else one
+                for one in cut
+            ]
+        findings = Findings(told)
         findings.refused, findings.notes = found.refused, found.notes
         findings.elements, findings.allowed_m = found.elements, found.allowed_m
         findings.alignment = found.alignment
         findings.shift, findings.crs, findings.tolerance_m = found.shift, found.crs, within
-        # Where the scanner stood may have been told to the search by hand.
-        stood = {scan.path: scan.stations for scan in found.scans}
-        told = [source.told() for source in sources.all]
-        findings.scans = [replace(scan, stations=stood.get(scan.path, scan.stations)) for scan in told]
+        findings.scans = seen
         findings.timings_s = clock.timings()
         return fill_folder(
             folder, findings, models=models, sought=before.models, parameters=before.parameters, seed=before.seed,

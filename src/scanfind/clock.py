@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from scanfind.progress import Progress
 
 # As results.json has them, with the total beside.
-STAGES = ("read", "library", "grid", "search", "verify", "refine", "isolate", "write")
+STAGES = ("read", "library", "grid", "search", "verify", "refine", "isolate", "measure", "write")
 
 
 class Clock:

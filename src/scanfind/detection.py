@@ -85,6 +85,27 @@ class PartFit:
         return self.off_m > max(tolerance_m, 3.0 * self.off_sigma_m)
 
 
+# What a dimension is of: a length, a radius, a face's tilt across its diameter, a distance from where the design puts
+# something (metres), an angle (radians).
+LINEAR, RADIUS, FACE, PLACE, ANGLE = "linear", "radius", "face", "place", "angle"
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """A key dimension as designed and as built, metres or, of an ANGLE, radians.
+
+    kind : one of LINEAR, RADIUS, FACE, PLACE, ANGLE
+    built, sigma : NaN where it was not measured; `why` says why not
+    """
+
+    name: str
+    kind: str
+    design: float
+    built: float
+    sigma: float
+    why: str = ""
+
+
 @dataclass(frozen=True, eq=False)
 class IsolatedPoints:
     """The raw points of one detection with all their attributes.
@@ -122,6 +143,7 @@ class Detection:
         of `unobservable` without a sigma. None in results of a version that had none
     pivot : (3,) the point the covariance is about, in the middle of the placed model, scene frame, metres
     parts : of an assembly, each measured by itself; empty where that was not asked for or it has but one
+    dimensions : what a drawing of it would give, as built; empty for a piece of scan and for free forms
     """
 
     id: int
@@ -139,6 +161,7 @@ class Detection:
     covariance: Floats | None = None
     pivot: tuple[float, float, float] | None = None
     parts: tuple[PartFit, ...] = ()
+    dimensions: tuple[Dimension, ...] = ()
 
     @property
     def sigma_m(self) -> float:

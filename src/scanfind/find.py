@@ -14,12 +14,13 @@ from scanfind.assembly import REACH_M
 from scanfind.clock import Clock, say_if_compiling, watched
 from scanfind.cloud import CloudModel, PointChunk
 from scanfind.detection import Findings
+from scanfind.dimensions import Plan, dimensioned, plan_of
 from scanfind.errors import UsageError, require
 from scanfind.fit.polish import polished
 from scanfind.grid.moments import MomentGrid
 from scanfind.grid.scene import build_scene
 from scanfind.isolation.deviation import deviation_of
-from scanfind.isolation.isolate import IsolateParameters, Placed
+from scanfind.isolation.isolate import IsolateParameters, Placed, nearer
 from scanfind.isolation.isolate import isolate as isolate_raw
 from scanfind.library import ModelLibrary, joint_table
 from scanfind.library.model import Model, ModelParameters
@@ -34,7 +35,7 @@ from scanfind.scans.sources import Scan, Sources, require_points
 from scanfind.threads import available_cores
 
 if TYPE_CHECKING:
-    from scanfind.detection import Detection
+    from scanfind.detection import Detection, IsolatedPoints
     from scanfind.kernels.distance import NearSurface
     from scanfind.progress import Progress
     from scanfind.recognition.recognise import Standing
@@ -109,20 +110,28 @@ def find(
     findings.refused = found.refused()
     if isolate and (parts := found.built()):
         with clock("isolate"):  # each part by its own raw points, in a pass of its own: where they are decides 3.5
-            around = near_parts(parts, watched(sources.chunks(), clock, tell, "isolate", sources.expected()), jobs)
-            findings[:] = [found.measured(one, around.get(one.id)) for one in findings]
+            beside = near_parts(parts, watched(sources.chunks(), clock, tell, "isolate", sources.expected()), jobs)
+            findings[:] = [found.measured(one, beside.get(one.id)) for one in findings]
     if isolate and (findings or remainder is not None):
         with clock("isolate"):  # 3.5 isolation: the second pass
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
             tolerance = isolation_tolerance(parameters.isolate, found.noise(), found.cell())
             findings.tolerance_m = tolerance
-            surfaces = surfaces_of(findings, library, tolerance)
-            built = {number: as_built(number, faces, tolerance) for number, faces in found.built().items()}
-            findings[:] = with_points(findings, surfaces, built, chunks, tolerance, remainder, jobs)
+            surfaces, plans = surfaces_of(findings, library, tolerance), plans_of(findings, library)
+            built, reach = found.built(), max([tolerance, *(plan.reach for plan in plans.values())])
+            findings[:], around = with_points(findings, surfaces, built, chunks, tolerance, remainder, jobs, reach)
         with clock("refine"):  # 3.4 once more, on the raw points: the exact surface, and how uncertain the pose is
             # Parts were fitted to the raw points before.
             findings[:] = [
                 one if one.parts else polished(one, surfaces[one.model], parameters.refine, jobs) for one in findings
+            ]
+        with clock("measure"):  # what a drawing would dimension, as built
+            stations = [place for source in sources.all for place in source.told().stations]
+            findings[:] = [
+                dimensioned(one, plan, surfaces[one.model], around[one.id], stations, reach, built.get(one.id))
+                if (plan := plans.get(one.model))
+                else one
+                for one in findings
             ]
     if at_design:
         with clock("verify"):
@@ -240,23 +249,34 @@ def surfaces_of(findings: Sequence[Detection], library: Sequence[Model], toleran
     return {model.name: near_model(model, tolerance) for model in library if model.name in names}
 
 
-def with_points(
-    findings: Sequence[Detection], surfaces: Mapping[str, NearSurface], built: Mapping[int, Placed],
-    chunks: Iterable[PointChunk], tolerance: float, remainder: CloudWriter | None, jobs: int,
-) -> list[Detection]:  # fmt: skip
-    """Each detection with its raw points and how far they are from its model.
+def plans_of(findings: Sequence[Detection], library: Sequence[Model]) -> dict[str, Plan]:
+    """What is to be measured of each model found, where it has anything a drawing would dimension."""
+    names = {found.model for found in findings}
+    plans = {model.name: plan_of(model.mesh) for model in library if model.name in names and model.mesh is not None}
+    return {name: plan for name, plan in plans.items() if plan.wanted}
 
-    built : by id, the surface of those fitted in parts, as built: what their points are cut and measured by
+
+def with_points(
+    findings: Sequence[Detection], surfaces: Mapping[str, NearSurface], built: Mapping[int, Floats],
+    chunks: Iterable[PointChunk], tolerance: float, remainder: CloudWriter | None, jobs: int, reach: float,
+) -> tuple[list[Detection], dict[int, IsolatedPoints]]:  # fmt: skip
+    """Each detection with its raw points and how far they are from its model; by id, all points within `reach`.
+
+    built : by id, the faces (F, 3, 3), scan frame, of those fitted in parts: what their points are cut and measured by
     """
     placed = [
-        built.get(found.id) or Placed(found.id, surfaces[found.model], found.scene_from_model) for found in findings
-    ]
-    rest = None if remainder is None else lambda chunk: write_rest(remainder, chunk)
-    points = isolate_raw(chunks, placed, IsolateParameters(tolerance), remainder=rest, jobs=jobs)
-    return [
-        found.with_points(cut := points[found.id], deviation_of(cut.deviation) if len(cut) else None)
+        as_built(found.id, built[found.id], reach)
+        if found.id in built
+        else Placed(found.id, surfaces[found.model]._replace(reach=reach), found.scene_from_model)
         for found in findings
     ]
+    rest = None if remainder is None else lambda chunk: write_rest(remainder, chunk)
+    points = isolate_raw(chunks, placed, IsolateParameters(reach), remainder=rest, jobs=jobs, own=tolerance)
+    told = [
+        found.with_points(cut := nearer(points[found.id], tolerance), deviation_of(cut.deviation) if len(cut) else None)
+        for found in findings
+    ]
+    return told, points
 
 
 def near_parts(built: Mapping[int, Floats], chunks: Iterable[PointChunk], jobs: int) -> dict[int, Floats]:

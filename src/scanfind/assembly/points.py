@@ -89,9 +89,8 @@ def spread_out(rows: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def placed_faces(mesh: Mesh, assembly: Assembly, parts: PlacedParts, there: Sequence[bool]) -> Floats:
-    """The faces (F, 3, 3) of the parts that are there, each where it was built, the parts' frame."""
-    corners = mesh.triangles()
-    moved = [
-        parts.pose(k).move(corners[assembly.part_of_face == k].reshape(-1, 3)) for k, one in enumerate(there) if one
-    ]
-    return np.concatenate(moved).reshape(-1, 3, 3)
+    """The faces (F, 3, 3) of the parts that are there, in the mesh's order, where they were built, the parts' frame."""
+    corners, part = mesh.triangles(), assembly.part_of_face
+    for k in range(len(there)):
+        corners[part == k] = parts.pose(k).move(corners[part == k].reshape(-1, 3)).reshape(-1, 3, 3)
+    return corners[np.isin(part, np.flatnonzero(there))]

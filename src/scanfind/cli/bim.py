@@ -39,7 +39,7 @@ def bim(
     move
         In --ifc, place what is installed where it was found.
     tolerance
-        What is out of tolerance: a TOML profile, or pipe-spools or structural-steel; as in the inspection unless given.
+        What is out of tolerance: a TOML profile, or a preset such as pipe-spools; as in the inspection unless given.
     overwrite
         Replace older files at --bcf and --ifc.
 

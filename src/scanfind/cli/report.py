@@ -35,7 +35,7 @@ def report(
     out
         Files to write: .html, .pdf, .csv, .xlsx; report.html unless given.
     tolerance
-        A profile: a TOML file, pipe-spools or structural-steel; what the inspection was given, unless given.
+        A profile: a TOML file, pipe-spools, structural-steel or fabricated-steel; the inspection's unless given.
     scan
         Scan files to show around what was found; those searched, unless given.
     title

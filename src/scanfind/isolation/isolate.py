@@ -156,12 +156,14 @@ def isolate(
     shift: ArrayLike = (0, 0, 0),
     remainder: Callable[[PointChunk], None] | None = None,
     jobs: int = 1,
+    own: float | None = None,
 ) -> dict[int, IsolatedPoints]:
     """The raw points of every placed model, by detection id, in the order of the stream; empty where there is none.
 
     chunks : all scans of the scene, file frame; `scan` must count on over files, for it becomes scan_id
     shift : (3,) taken off the file's coordinates before the poses hold, metres
     remainder : receives what is left of each chunk, one for one and possibly empty: the scene without the found objects
+    own : what is farther from a surface than this, metres, is left over too, though it is cut out; None: nothing is
 
     jobs : threads, on which the result does not depend
 
@@ -178,7 +180,7 @@ def isolate(
         for key, piece in pieces_of(chunk, owner, deviation):
             pieces[key].append(piece)
         if remainder is not None:
-            remainder(subset(chunk, owner == 0))
+            remainder(subset(chunk, (owner == 0) | (np.abs(deviation) > np.float32(np.inf if own is None else own))))
     return {key: joined(mine, fields) for key, mine in pieces.items()}
 
 
@@ -202,6 +204,15 @@ def pieces_of(
                 deviation=deviation[rows[part]],
             ),
         )
+
+
+def nearer(points: IsolatedPoints, distance: float) -> IsolatedPoints:
+    """Those of isolated points that are no farther from the surface than a distance, metres."""
+    near = np.abs(points.deviation) <= np.float32(distance)
+    attributes = {name: values[near] for name, values in points.attributes.items()}
+    return IsolatedPoints(
+        points.xyz[near], attributes, points.scan_id[near], points.source_index[near], points.deviation[near]
+    )
 
 
 def subset(chunk: PointChunk, rows: NDArray[Any]) -> PointChunk:

@@ -9,8 +9,9 @@ from math import degrees
 from typing import TYPE_CHECKING
 
 from scanfind.design.elements import INSTALLED, NO_DATA, NOT_ENOUGH_DATA, NOT_FOUND, OCCLUDED, UNCERTAIN
+from scanfind.report.dimensions import Line, lines_of
 from scanfind.results.explain import STATUS_WORDS, detection_sentences, element_sentences, headline
-from scanfind.tolerances import IN, NOT_JUDGED, OUT, Judgement, judge_detection, judge_element
+from scanfind.tolerances import IN, NOT_JUDGED, OUT, Check, Judgement, judge_detection, judge_element
 
 if TYPE_CHECKING:
     from scanfind.results.schema import DetectionEntry, ElementEntry, Matrix, Results
@@ -69,6 +70,16 @@ class Item:
     def p95_m(self) -> float | None:
         """Within which distance of its surface 95 % of its points lie, metres."""
         return None if self.found is None or self.found.deviation is None else self.found.deviation.p95_m
+
+    @property
+    def dimensions(self) -> list[Line]:
+        """Its key dimensions."""
+        return lines_of(self)
+
+    @property
+    def other_checks(self) -> list[Check]:
+        """What it was held against besides these."""
+        return [check for check in self.judgement.checks if not check.is_of_dimension] if self.judgement else []
 
     @property
     def is_fine(self) -> bool:

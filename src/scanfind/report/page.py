@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from scanfind.errors import MissingExtraError
 from scanfind.picture import SCALE
+from scanfind.report.dimensions import HEADS
 from scanfind.report.scene import scene_of
 
 if TYPE_CHECKING:
@@ -68,6 +69,7 @@ def page_of(content: Content) -> bytes:
         columns=OF_DESIGN if content.of_design else OF_INSTANCES,
         rows=[Row(item, _cells(item, of_design=content.of_design)) for item in content.items],
         has_design=content.of_design,
+        heads=HEADS,
         notes=content.notes(),
         made=content.made_by(),
         style=Markup(style),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from html import escape
 from itertools import pairwise
 from math import degrees
@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 from scanfind.design.elements import INSTALLED
 from scanfind.errors import MissingExtraError
 from scanfind.picture import SCALE, png
+from scanfind.report.dimensions import HEADS
 from scanfind.report.pictures import picture_of
 from scanfind.tolerances import NOT_JUDGED
 
 if TYPE_CHECKING:
     from scanfind.report.content import Content
+    from scanfind.report.dimensions import Line
     from scanfind.report.items import Item
 
 MOST_DETAILED = 100  # items with a page's half each: what has more is read on a screen
@@ -104,7 +106,7 @@ def _counts(content: Content, style: dict[str, Any], width: float) -> Any:
 
 def _table(content: Content, style: dict[str, Any], width: float) -> Any:
     """One line an item."""
-    from reportlab.platypus import Paragraph, Table, TableStyle
+    from reportlab.platypus import Paragraph
 
     heads = ("Element", "Status", "Verdict", "Off mm", "Turned °", "Surface mm", "Points")
     if not content.of_design:
@@ -129,16 +131,7 @@ def _table(content: Content, style: dict[str, Any], width: float) -> Any:
             [Paragraph(text, style["small"]) for text in words]
             + [Paragraph(number, style["right"]) for number in numbers]
         )
-    shares = (0.27, 0.15, 0.18, 0.09, 0.1, 0.11, 0.1)
-    table = Table(rows, colWidths=[share * width for share in shares], repeatRows=1)
-    table.setStyle(
-        TableStyle([
-            ("LINEBELOW", (0, 0), (-1, -1), 0.4, LINE), ("VALIGN", (0, 0), (-1, -1), "TOP"),
-            ("LEFTPADDING", (0, 0), (0, -1), 0), ("TOPPADDING", (0, 0), (-1, -1), 1.5),
-            ("BOTTOMPADDING", (0, 0), (-1, -1), 1.5),
-        ])
-    )  # fmt: skip
-    return table
+    return _ruled(rows, (0.27, 0.15, 0.18, 0.09, 0.1, 0.11, 0.1), width)
 
 
 def _detail(content: Content, item: Item, full: float, style: dict[str, Any], width: float) -> Iterator[Any]:
@@ -161,6 +154,37 @@ def _detail(content: Content, item: Item, full: float, style: dict[str, Any], wi
         wide = 0.72 * width
         told += [Spacer(1, 4), Image(io.BytesIO(png(picture)), wide, wide * PICTURE[1] / PICTURE[0], hAlign="LEFT")]
     yield KeepTogether(told)
+    if lines := item.dimensions:
+        yield Spacer(1, 6)
+        yield _dimensions(lines, style, width)
+
+
+def _dimensions(lines: Sequence[Line], style: dict[str, Any], width: float) -> Any:
+    """The key dimensions of an item, one a line; of those not measured, why."""
+    from reportlab.platypus import Paragraph
+
+    rows = [[Paragraph(f"<b>{head}</b>", style["right" if k else "small"]) for k, head in enumerate(HEADS)]]
+    for line in lines:
+        name, *numbers = (_safe(cell) for cell in line.cells())
+        why = f'<br/><font color="{SOFT}">{_safe(line.why)}</font>' if line.why else ""
+        first = Paragraph(f"{_dot(line.verdict)}{name}{why}", style["small"])
+        rows.append([first, *(Paragraph(number, style["right"]) for number in numbers)])
+    return _ruled(rows, (0.42, 0.14, 0.12, 0.12, 0.09, 0.11), width)
+
+
+def _ruled(rows: Sequence[Sequence[Any]], shares: Sequence[float], width: float) -> Any:
+    """A table with a line below each row, its first row again on every page."""
+    from reportlab.platypus import Table, TableStyle
+
+    table = Table(rows, colWidths=[share * width for share in shares], repeatRows=1)
+    table.setStyle(
+        TableStyle([
+            ("LINEBELOW", (0, 0), (-1, -1), 0.4, LINE), ("VALIGN", (0, 0), (-1, -1), "TOP"),
+            ("LEFTPADDING", (0, 0), (0, -1), 0), ("TOPPADDING", (0, 0), (-1, -1), 1.5),
+            ("BOTTOMPADDING", (0, 0), (-1, -1), 1.5),
+        ])
+    )  # fmt: skip
+    return table
 
 
 def _legend(full: float, style: dict[str, Any], width: float) -> Iterator[Any]:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 RESULTS_JSON = "results.json"
 RESULTS_CSV = "results.csv"
 ELEMENTS_CSV = "elements.csv"
+DIMENSIONS_CSV = "dimensions.csv"
 MODELS = "models.scanfind"
 
 NAME_BYTES = 120  # of a model's name in a file name; file systems stop at 255
@@ -173,6 +174,8 @@ def fill_folder(
     _write_csv(folder / RESULTS_CSV, results)
     if results.elements:
         _write_elements(folder / ELEMENTS_CSV, results)
+    if any(found.dimensions for found in results.detections):
+        _write_dimensions(folder / DIMENSIONS_CSV, results)
     took = time.perf_counter() - began
     timings = results.timings_s | {"write": took, "total": results.timings_s["total"] + took}
     results = results.model_copy(update={"timings_s": timings})
@@ -314,6 +317,23 @@ def _write_elements(path: Path, results: schema.Results) -> None:
             ])  # fmt: skip
 
 
+DIMENSION_COLUMNS = ("id", "model", "dimension", "kind", "unit", "design", "built", "difference", "sigma", "why")
+
+
+def _write_dimensions(path: Path, results: schema.Results) -> None:
+    """One line a key dimension of a detection, metres or degrees."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        out = csv.writer(file)
+        out.writerow(DIMENSION_COLUMNS)
+        for found in results.detections:
+            for each in found.dimensions:
+                unit, factor = ("deg", degrees(1.0)) if each.kind == "angle" else ("m", 1.0)
+                difference = None if each.built is None else each.built - each.design
+                values = (each.design, each.built, difference, each.sigma)
+                numbers = [None if value is None else factor * value for value in values]
+                out.writerow([found.id, found.model, each.name, each.kind, unit, *numbers, each.why])
+
+
 def _files_under(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
 
@@ -322,6 +342,7 @@ def _files_of(results: schema.Results) -> set[str]:
     """What a result folder with this results.json holds."""
     parts = [name for found in results.detections for name in (found.pose, found.isolated)]
     elements = [ELEMENTS_CSV] if results.elements else []
+    elements += [DIMENSIONS_CSV] if any(found.dimensions for found in results.detections) else []
     return {RESULTS_JSON, RESULTS_CSV, MODELS, *elements, *(name for name in [*parts, results.remainder] if name)}
 
 

@@ -18,7 +18,7 @@ from pydantic_core import to_jsonable_python
 from scanfind.clock import STAGES
 from scanfind.design.alignment import Alignment
 from scanfind.design.elements import Element
-from scanfind.detection import Detection, Deviation, Findings, Motion, PartFit, Refused, SceneScan
+from scanfind.detection import Detection, Deviation, Dimension, Findings, Motion, PartFit, Refused, SceneScan
 from scanfind.mesh import Placement
 from scanfind.pose import Pose
 from scanfind.results import schema
@@ -169,6 +169,18 @@ def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -
         sigma_m=_or_none(found.sigma_m),
         sigma_rad=_or_none(found.sigma_rad),
         parts=[_part_entry(part) for part in found.parts],
+        dimensions=[_dimension_entry(each) for each in found.dimensions],
+    )
+
+
+def _dimension_entry(each: Dimension) -> schema.DimensionEntry:
+    return schema.DimensionEntry(
+        name=each.name,
+        kind=each.kind,
+        design=each.design,
+        built=_or_none(each.built),
+        sigma=_or_none(each.sigma),
+        why=each.why,
     )
 
 
@@ -291,6 +303,10 @@ def _detection(entry: schema.DetectionEntry) -> Detection:
         covariance=None if entry.covariance is None else np.array(entry.covariance),
         pivot=entry.pivot_m,
         parts=tuple(_part(part) for part in entry.parts),
+        dimensions=tuple(
+            Dimension(each.name, each.kind, each.design, _or_nan(each.built), _or_nan(each.sigma), each.why)
+            for each in entry.dimensions
+        ),
     )
 
 

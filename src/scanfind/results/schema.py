@@ -128,6 +128,22 @@ class PartEntry(Entry):
     penalty: float | None
 
 
+class DimensionEntry(Entry):
+    """A key dimension as designed and as built; metres, of the kind `angle` radians.
+
+    `kind`: linear, radius, face (its tilt across its diameter), place (how far from where the design puts it) or angle.
+    `sigma` is a standard deviation, of what the points of its surfaces disagree by. `built` and `sigma` are null where
+    it was not measured, and `why` says why.
+    """
+
+    name: str
+    kind: str
+    design: float
+    built: float | None
+    sigma: float | None
+    why: str = ""
+
+
 class DetectionEntry(Entry):
     """One instance of one model. `isolated` and `pose` are files of the result folder, null where none was written.
 
@@ -140,6 +156,9 @@ class DetectionEntry(Entry):
 
     `parts` is empty where they were not asked for (`assembly.parts`, --parts) and where the model has but one. With
     parts, `isolated` and `deviation` are of the parts where they were built.
+
+    `dimensions` are what a drawing would give: of a model with round parts its flange faces and pipes, of another its
+    extents. They are empty for pieces of scan and free forms, and in results of an earlier version.
     """
 
     id: int
@@ -163,6 +182,7 @@ class DetectionEntry(Entry):
     sigma_m: float | None = None
     sigma_rad: float | None = None
     parts: list[PartEntry] = []
+    dimensions: list[DimensionEntry] = []
 
 
 class RefusedEntry(Entry):

@@ -31,6 +31,7 @@ from pydantic_core import to_jsonable_python
 from scanfind.clock import Clock, say_if_compiling
 from scanfind.cloud import shift_for
 from scanfind.detection import Findings
+from scanfind.dimensions import dimensioned
 from scanfind.errors import Interrupted, UnreadableFileError, UnsupportedFormatError, UsageError
 from scanfind.find import ModelInput, box_searched, isolation_tolerance, models_of, require_points_in
 from scanfind.fit.polish import polished
@@ -64,6 +65,7 @@ from scanfind.tiles.tasks import (
     gathered,
     on_disk,
     own,
+    plan_in,
     search,
     sum_up,
     surface_of,
@@ -365,6 +367,7 @@ def isolate_all(
         tell("isolate", done, expected)
 
     cuts = list(zip([job.folder / name for name in tasks], all_done(job.folder, crew, tasks, told), strict=True))
+    stations = [place for one in summed for place in one.told.stations]
     measured = []
     for one in findings:
         cut_out = gathered(cuts, one.id)
@@ -372,6 +375,9 @@ def isolate_all(
         with clock("refine"):
             surface = surface_of(job.folder, one.model, tolerance)
             fitted = polished(with_points, surface, job.parameters.refine, job.jobs)
+        with clock("measure"):
+            if (plan := plan_in(job.folder, one.model)) and fitted.isolated is not None:
+                fitted = dimensioned(fitted, plan, surface, fitted.isolated, stations, tolerance, jobs=job.jobs)
         points = fitted.isolated or cut_out
         try:
             measured.append(replace(fitted, isolated=on_disk(points, job.folder / f"points-{one.id:05d}")))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from scanfind.clock import Clock
 from scanfind.detection import Detection, IsolatedPoints, Refused, SceneScan
+from scanfind.dimensions import plan_of
 from scanfind.errors import InvalidGeometryError, UnreadableFileError, UnsupportedFormatError
 from scanfind.find import recognise
 from scanfind.grid.moments import MomentGrid
@@ -30,6 +31,7 @@ from scanfind.tiles.plan import BASE_BYTES, Tile, bin_metres, margin_bins
 from scanfind.tiles.stored import Store, beams_into, count_in, parts_of, rows_in, summed_rows
 
 if TYPE_CHECKING:
+    from scanfind.dimensions import Plan
     from scanfind.kernels.distance import NearSurface
     from scanfind.library.model import Model
 
@@ -128,6 +130,14 @@ def models_in(folder: Path) -> list[Model]:
 def surface_of(folder: Path, name: str, reach: float) -> NearSurface:
     """A model's surface, made once a worker."""
     return near_model(next(model for model in models_in(folder) if model.name == name), reach)
+
+
+@lru_cache(maxsize=256)
+def plan_in(folder: Path, name: str) -> Plan | None:
+    """What is to be measured of a model; None where there is nothing."""
+    mesh = next(model for model in models_in(folder) if model.name == name).mesh
+    plan = None if mesh is None else plan_of(mesh)
+    return plan if plan and plan.wanted else None
 
 
 def sum_up(folder: Path, job: Job, scan: Scan, number: int) -> Summed:

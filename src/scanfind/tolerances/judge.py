@@ -14,10 +14,19 @@ from math import degrees, hypot, inf
 import numpy as np
 
 from scanfind.design.elements import IN_TOLERANCE, INSTALLED, OUT_OF_TOLERANCE
+from scanfind.detection import ANGLE, FACE, LINEAR, PLACE, RADIUS
 from scanfind.results.explain import STATUS_WORDS, length
-from scanfind.results.schema import DetectionEntry, ElementEntry, ModelEntry, MotionEntry, PartEntry, Results
+from scanfind.results.schema import (
+    DetectionEntry,
+    DimensionEntry,
+    ElementEntry,
+    ModelEntry,
+    MotionEntry,
+    PartEntry,
+    Results,
+)
 from scanfind.tolerances.discs import Disc
-from scanfind.tolerances.profile import Limit, Profile
+from scanfind.tolerances.profile import OF_DIMENSIONS, Limit, Profile
 
 IN, OUT, NOT_JUDGED = IN_TOLERANCE, OUT_OF_TOLERANCE, "not_judged"
 
@@ -36,7 +45,13 @@ WHAT = {
     "tilt_mm": "tilt across its diameter",
     "surface_p95_mm": "95 % of its points, from the surface",
     "surface_mean_mm": "its points in the mean, from the surface",
+    "linear_mm": "off the drawing",
+    "radius_mm": "off the drawing",
+    "face_mm": "off the drawing",
+    "place_mm": "off the drawing",
+    "angle_deg": "off the drawing",
 }
+LIMIT_OF = {LINEAR: "linear_mm", RADIUS: "radius_mm", FACE: "face_mm", PLACE: "place_mm", ANGLE: "angle_deg"}
 
 
 @dataclass(frozen=True)
@@ -50,7 +65,11 @@ class Measured:
 
 @dataclass(frozen=True)
 class Check:
-    """One limit held against one measurement. `part` is empty for the whole; value None: there is none, see `why`."""
+    """One limit held against one measurement.
+
+    part : or dimension; empty for the whole
+    value : None where there is none, see `why`
+    """
 
     key: str
     part: str
@@ -58,6 +77,11 @@ class Check:
     value: float | None
     verdict: str
     why: str
+
+    @property
+    def is_of_dimension(self) -> bool:
+        """Is it about a key dimension?"""
+        return self.key in OF_DIMENSIONS
 
     def words(self) -> str:
         """For people: "shift of its middle 12 mm, allowed 3.0 mm (PFI ES-3 …)"."""
@@ -112,7 +136,17 @@ def _judged(
 ) -> Judgement:  # fmt: skip
     """All limits of a profile held against one element. A measurement that is a str could not be made: that is why."""
     limits = profile.limits(**words)
-    checks = [_check(key, "", limit, whole[key]) for key, limit in limits.items() if placed or key in whole]
+    checks = [
+        _check(key, "", limit, whole[key])
+        for key, limit in limits.items()
+        if key not in OF_DIMENSIONS and (placed or key in whole)
+    ]
+    checks += [
+        _check(key, each.name, limit, _dimension(each))
+        for each in found.dimensions
+        for key, limit in profile.limits(**words, dimension=each.name).items()
+        if key == LIMIT_OF[each.kind]
+    ]
     for part in found.parts:
         of_part = profile.limits(**words, part=part.name)
         if of_part:
@@ -226,6 +260,13 @@ def _cut(p95: float, within: float) -> Measured | str:
     if p95 > 0.9 * within:
         return f"points were cut out only to {length(within)} from it: cut them again with a larger --tolerance"
     return Measured(p95)
+
+
+def _dimension(each: DimensionEntry) -> Measured | str:
+    """How far a dimension is from the drawing, or why nobody knows."""
+    if each.built is None or each.sigma is None:
+        return each.why or "not measured"
+    return Measured(each.built - each.design, each.sigma)
 
 
 def _part(part: PartEntry, disc: Disc | None) -> dict[str, Measured | str]:

@@ -27,11 +27,17 @@ UNITS: Mapping[str, float] = {
     "tilt_mm": 1e-3,
     "surface_p95_mm": 1e-3,
     "surface_mean_mm": 1e-3,
+    "linear_mm": 1e-3,
+    "radius_mm": 1e-3,
+    "face_mm": 1e-3,
+    "place_mm": 1e-3,
+    "angle_deg": radians(1.0),
 }
-PATTERNS = ("class", "type", "name", "part")
+PATTERNS = ("class", "type", "name", "part", "dimension")
 OF_PARTS = ("shift_mm", "off_mm", "turn_deg", "roll_mm", "tilt_mm")
-OF_WHOLES = ("shift_mm", "off_mm", "turn_deg", "surface_p95_mm", "surface_mean_mm")
-PRESETS = ("pipe-spools", "structural-steel")
+OF_DIMENSIONS = ("linear_mm", "radius_mm", "face_mm", "place_mm", "angle_deg")
+OF_WHOLES = ("shift_mm", "off_mm", "turn_deg", "surface_p95_mm", "surface_mean_mm", *OF_DIMENSIONS)
+PRESETS = ("pipe-spools", "structural-steel", "fabricated-steel")
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,8 @@ class Limit:
 class Rule:
     """Limits of the elements that all patterns fit.
 
-    patterns : of class, type, name, part → glob patterns of which one must fit; without `part` the rule is of wholes
+    patterns : of PATTERNS → glob patterns of which one must fit; without `part` the rule is of wholes, and without
+        `dimension` of all their dimensions
     limits : key of UNITS → limit
     """
 
@@ -71,7 +78,7 @@ class Profile:
     rules: tuple[Rule, ...] = field(default=())
 
     def limits(self, **words: str) -> dict[str, Limit]:
-        """The limits of what goes by these words: class, type, name, and part where it is one."""
+        """The limits of what goes by these words: class, type, name, and part or dimension where it is one."""
         found: dict[str, Limit] = {}
         for rule in self.rules:
             if rule.fits(words):
@@ -119,13 +126,14 @@ def _rule(table: Mapping[str, Any], where: str, number: int) -> Rule:
     at = f"rule {number}: "
     _known(table, (*PATTERNS, *UNITS), where, at)
     patterns = {kind: _patterns(table[kind], where, f"{at}{kind}") for kind in PATTERNS if kind in table}
-    allowed = OF_PARTS if "part" in patterns else OF_WHOLES
+    allowed = OF_PARTS if "part" in patterns else OF_DIMENSIONS if "dimension" in patterns else OF_WHOLES
     limits = {}
     for key in UNITS:
         if key not in table:
             continue
         if key not in allowed:
             what = "parts, name them with `part`" if key in OF_PARTS else "whole elements, leave out `part`"
+            what = "dimensions, leave out `part`" if key in OF_DIMENSIONS else what
             msg = f"{where}: {at}{key} is a limit of {what}"
             raise UsageError(msg)
         limits[key] = _limit(table[key], UNITS[key], where, f"{at}{key}")
