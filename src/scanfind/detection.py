@@ -14,6 +14,7 @@ from scanfind.pose import Pose
 if TYPE_CHECKING:
     from scanfind.alignment import Alignment
     from scanfind.elements import Element
+    from scanfind.tolerances.profile import Profile
 
 Floats = NDArray[np.float64]
 
@@ -182,7 +183,7 @@ class Findings(list[Detection]):
 
     tolerance_m : within which raw points were isolated, metres; None where they were not
     elements : of the design, what became of each; empty where that was not asked for
-    allowed_m : by how much an element may be off, metres; None: nobody says
+    profile : how far elements may be off; None: nobody says
     missing : scans that could not be read and were left out, and why
     alignment : where the design lies in the scans, where that was found; None: they are in one frame
     """
@@ -195,7 +196,7 @@ class Findings(list[Detection]):
     notes: list[str]
     tolerance_m: float | None
     elements: list[Element]
-    allowed_m: float | None
+    profile: Profile | None
     missing: list[str]
     alignment: Alignment | None
 
@@ -203,4 +204,4 @@ class Findings(list[Detection]):
         super().__init__(detections or [])
         self.refused, self.scans, self.notes, self.elements, self.missing = [], [], [], [], []
         self.shift, self.crs, self.timings_s, self.tolerance_m = (0.0, 0.0, 0.0), None, {}, None
-        self.allowed_m, self.alignment = None, None
+        self.profile, self.alignment = None, None

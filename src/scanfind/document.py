@@ -72,8 +72,8 @@ def document(
         models=list(models),
         detections=[_detection_entry(found, *files.get(found.id, (None, None))) for found in findings],
         refused=[_refused_entry(refused) for refused in findings.refused],
-        elements=[_element_entry(element, findings.allowed_m) for element in findings.elements],
-        allowed_m=findings.allowed_m,
+        elements=[_element_entry(element) for element in findings.elements],
+        profile=None if findings.profile is None else findings.profile.tables(),
         alignment=None if findings.alignment is None else _alignment_entry(findings.alignment),
         remainder=remainder,
         notes=list(findings.notes),
@@ -83,10 +83,10 @@ def document(
 
 
 def findings_of(results: schema.Results) -> Findings:
-    """What `document` was given, made back from what it gave; all but the points."""
+    """What `document` was given, made back from what it gave; all but the points and the tolerance profile."""
     findings = Findings([_detection(entry) for entry in results.detections])
     findings.refused = [_refused(entry) for entry in results.refused]
-    findings.elements, findings.allowed_m = [_element(entry) for entry in results.elements], results.allowed_m
+    findings.elements = [_element(entry) for entry in results.elements]
     findings.alignment = None if results.alignment is None else _alignment(results.alignment)
     findings.scans = [SceneScan(scan.path, scan.points, scan.dropped, tuple(scan.stations_m)) for scan in results.scans]
     findings.shift, findings.crs, findings.notes = results.shift_m, results.crs, list(results.notes)
@@ -221,7 +221,7 @@ def _refused_entry(refused: Refused) -> schema.RefusedEntry:
     )
 
 
-def _element_entry(element: Element, allowed_m: float | None) -> schema.ElementEntry:
+def _element_entry(element: Element) -> schema.ElementEntry:
     placement = element.placement
     return schema.ElementEntry(
         global_id=placement.global_id,
@@ -229,7 +229,8 @@ def _element_entry(element: Element, allowed_m: float | None) -> schema.ElementE
         name=placement.name,
         model=element.model,
         status=element.status,
-        verdict=element.verdict(allowed_m),
+        verdict=element.verdict,
+        verdict_why=element.verdict_why,
         detection=element.detection,
         design_from_model=rows(placement.design_from_model),
         shift_m=element.shift_m,
@@ -322,7 +323,7 @@ def _element(entry: schema.ElementEntry) -> Element:
     moved = None if entry.built_from_design is None else _pose(entry.built_from_design)
     return Element(
         placement, entry.model, entry.status, entry.detection, entry.shift_m, entry.turn_rad, entry.off_m, entry.on,
-        entry.beside, entry.through, entry.hidden, entry.why, moved,
+        entry.beside, entry.through, entry.hidden, entry.why, moved, entry.verdict, entry.verdict_why,
     )  # fmt: skip
 
 

@@ -38,7 +38,7 @@ MAY_BE, IS_NOT = 0.5, 0.7
 # Farther from its place than this and it may as well be another part of the same shape.
 FAR_M = 0.5
 SAID_M = 0.002  # what a motion that is held at the design's would add is told from here on
-IN_TOLERANCE, OUT_OF_TOLERANCE = "in_tolerance", "out_of_tolerance"
+IN_TOLERANCE, OUT_OF_TOLERANCE, NOT_JUDGED = "in_tolerance", "out_of_tolerance", "not_judged"
 PAIRED_BY = 50  # samples, which lie evenly over the model: they tell which of two places is nearer
 
 
@@ -57,6 +57,8 @@ class Element:
     why : the evidence in words
     built_from_design : what moves it from its place in the design to where it stands, in the design's axes about their
         origin; without the motions the scan hardly fixes. None unless installed
+    verdict, verdict_why : in_tolerance, out_of_tolerance or not_judged, and why (see `scanfind.tolerances`); None
+        unless it is installed and somebody said how far off it may be
     """
 
     placement: Placement
@@ -72,12 +74,8 @@ class Element:
     hidden: float | None
     why: str
     built_from_design: Pose | None = None
-
-    def verdict(self, allowed_m: float | None) -> str | None:
-        """Is it where it should be to within so many metres? None where it was not found or nobody says how far."""
-        if self.off_m is None or allowed_m is None or self.status != INSTALLED:
-            return None
-        return IN_TOLERANCE if self.off_m <= allowed_m else OUT_OF_TOLERANCE
+    verdict: str | None = None
+    verdict_why: str = ""
 
 
 def placements_of(model: Model) -> tuple[Placement, ...]:

@@ -180,9 +180,9 @@ class ElementEntry(Entry):
 
     `design_from_model`: where the design puts it, in the scan's frame (moved there by `alignment`, where there is one).
 
-    `status`: installed, uncertain, occluded, not_found, not_enough_data or no_data. `verdict`: in_tolerance or
-    out_of_tolerance, null where it was not found or no `allowed_m` was given. `detection`: the id of the instance taken
-    for it. `shift_m` of its middle, in the scan's axes, `turn_rad` by what angle it is turned, `off_m` how far the
+    `status`: installed, uncertain, occluded, not_found, not_enough_data or no_data. `verdict`: in_tolerance,
+    out_of_tolerance or not_judged, `verdict_why` in words; null where it was not found or there is no `profile`.
+    `detection`: the id of the instance taken for it. `shift_m` of its middle, in the scan's axes, `turn_rad` by what angle it is turned, `off_m` how far the
     point of its surface that moved the most did; all null where it was not found. `on`, `beside`, `through`, `hidden`:
     what beams say at the design's place, as shares of the surface they went to: they ended on it, near it but not on
     it, behind it, before it; null where no scanner position is known. `built_from_design` moves it from its place in
@@ -207,6 +207,7 @@ class ElementEntry(Entry):
     hidden: float | None
     why: str
     built_from_design: Matrix | None = None
+    verdict_why: str = ""
 
 
 class AlignmentEntry(Entry):
@@ -230,7 +231,8 @@ class Results(Entry):
     """results.json. `shift_m` was taken off while computing; every coordinate here has it added back.
 
     `tolerance_m` is within which points were isolated, null where they were not. `elements` are those of the design,
-    where a search was asked what became of it; `allowed_m` by how much they may be off. `made`: when this was written,
+    where a search was asked what became of it; `profile` by how much they may be off, as a TOML file says it (see
+    docs/report.md). `allowed_m` says so in results of an earlier version: no point of theirs by more. `made`: when this was written,
     UTC as in 2026-11-22T17:30:00Z, null in results of an earlier version. `alignment`: null where scans and design are
     in one frame.
     """
@@ -248,6 +250,7 @@ class Results(Entry):
     detections: list[DetectionEntry]
     refused: list[RefusedEntry]
     elements: list[ElementEntry] = []
+    profile: dict[str, Any] | None = None
     allowed_m: float | None = None
     alignment: AlignmentEntry | None = None
     remainder: str | None = None

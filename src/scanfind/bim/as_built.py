@@ -52,7 +52,7 @@ def write_as_built(
     MissingExtraError without ifcopenshell, OutputError where `out` is the design itself or cannot be written.
     """
     need_extra("ifcopenshell", "ifc", "IFC")
-    results, _ = inspected(result_dir, tolerance)
+    results = inspected(result_dir, tolerance)
     if not Path(design).is_file():
         msg = f"{design}: {'not a file' if Path(design).exists() else 'no such file'}"
         raise UnreadableFileError(msg)
@@ -180,12 +180,13 @@ class Properties:
         """Name, measure and value of each property; None where it is not known."""
         yield "Status", "IfcLabel", element.status
         yield "Verdict", "IfcLabel", element.verdict
+        yield "VerdictReason", "IfcText", element.verdict_why or None
         yield "Reason", "IfcText", element.why
         for axis, shift in zip("XYZ", element.shift_m or (None, None, None), strict=True):
             yield f"Shift{axis}", "IfcLengthMeasure", self._in(shift, self._length)
         yield "Turn", "IfcPlaneAngleMeasure", self._in(element.turn_rad, self._angle)
         yield "LargestDisplacement", "IfcLengthMeasure", self._in(element.off_m, self._length)
-        yield "Allowed", "IfcLengthMeasure", self._in(self._results.allowed_m, self._length)
+        yield "Tolerances", "IfcLabel", self._tolerances
         if found is not None:
             yield "SeenShare", "IfcReal", found.coverage
         if found is not None and (deviation := found.deviation) is not None:
