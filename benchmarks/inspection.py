@@ -19,12 +19,12 @@ import numpy as np
 import scanfind
 from benchmarks.common import ROOT, Floats, median, seeds_of, tell, write_csv
 from scanfind.cloud import PointCloud
-from scanfind.elements import INSTALLED, NOT_FOUND
+from scanfind.design.elements import INSTALLED, NOT_FOUND
+from scanfind.evidence.rays import RayCaster
 from scanfind.find import models_of
 from scanfind.library import ModelLibrary
 from scanfind.mesh import Mesh, Placement
 from scanfind.models import read_models
-from scanfind.rays import RayCaster
 from scanfind.simulate.parts import blocks
 from scanfind.simulate.placement import sample_oriented
 from scanfind.simulate.scanner import Scanner, scan

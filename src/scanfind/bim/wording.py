@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scanfind.document import rows
-from scanfind.elements import INSTALLED, OUT_OF_TOLERANCE
+from scanfind.design.elements import INSTALLED, OUT_OF_TOLERANCE
 from scanfind.errors import UsageError
-from scanfind.explain import element_sentences, headline
 from scanfind.library import ModelLibrary
 from scanfind.pose import Pose
 from scanfind.results import MODELS, read_results
+from scanfind.results.document import rows
+from scanfind.results.explain import element_sentences, headline
 from scanfind.tolerances import judge_results, load_profile
 
 if TYPE_CHECKING:
-    from scanfind.schema import ElementEntry, Results
+    from scanfind.results.schema import ElementEntry, Results
 
 
 def inspected(result_dir: str | Path, tolerance: str | Path | None = None) -> Results:
@@ -92,4 +92,3 @@ def description(results: Results, element: ElementEntry) -> str:
 def scans_in_words(results: Results) -> str:
     """The names of the scan files, without their folders."""
     return ", ".join(scan.path.replace("\\", "/").rpartition("/")[2] for scan in results.scans) or "unknown"
-

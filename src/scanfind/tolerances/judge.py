@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scanfind.document import document, model_entries
-from scanfind.elements import IN_TOLERANCE, INSTALLED, NOT_JUDGED, OUT_OF_TOLERANCE
-from scanfind.explain import STATUS_WORDS, length
-from scanfind.schema import DetectionEntry, ElementEntry, ModelEntry, MotionEntry, PartEntry, Results
+from scanfind.design.elements import IN_TOLERANCE, INSTALLED, NOT_JUDGED, OUT_OF_TOLERANCE
+from scanfind.results.document import document, model_entries
+from scanfind.results.explain import STATUS_WORDS, length
+from scanfind.results.schema import DetectionEntry, ElementEntry, ModelEntry, MotionEntry, PartEntry, Results
 from scanfind.tolerances.discs import Disc, discs_of
 from scanfind.tolerances.profile import Limit, Profile, allowed_off, profile_of
 
