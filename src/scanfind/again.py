@@ -17,6 +17,7 @@ from scanfind.results import MODELS, fill_folder, open_remainder, read_results, 
 from scanfind.results.document import findings_of
 from scanfind.scans.sources import Sources
 from scanfind.threads import available_cores
+from scanfind.tolerances import judge_findings, profile_in
 
 if TYPE_CHECKING:
     from scanfind.progress import Progress
@@ -61,13 +62,14 @@ def isolate_again(
             surfaces = surfaces_of(found, models.models(), within)
             findings = Findings(with_points(found, surfaces, {}, chunks, within, rest, available_cores()))
         findings.refused, findings.notes = found.refused, found.notes
-        findings.elements, findings.allowed_m = found.elements, found.allowed_m
-        findings.alignment = found.alignment
+        findings.elements, findings.alignment = found.elements, found.alignment
         findings.shift, findings.crs, findings.tolerance_m = found.shift, found.crs, within
         # Where the scanner stood may have been told to the search by hand.
         stood = {scan.path: scan.stations for scan in found.scans}
         told = [source.told() for source in sources.all]
         findings.scans = [replace(scan, stations=stood.get(scan.path, scan.stations)) for scan in told]
+        if profile := profile_in(before):
+            judge_findings(findings, profile, models)
         findings.timings_s = clock.timings()
         return fill_folder(
             folder, findings, models=models, sought=before.models, parameters=before.parameters, seed=before.seed,

@@ -17,6 +17,7 @@ from scanfind.models.child import need_extra, one_line
 from scanfind.models.ifc_select import members
 from scanfind.pose import Pose
 from scanfind.results import result_file
+from scanfind.tolerances import profile_in
 
 if TYPE_CHECKING:
     from scanfind.results.schema import DetectionEntry, ElementEntry, Results
@@ -159,6 +160,8 @@ class Properties:
         self._file, self._results = file, results
         self._length = calculate_unit_scale(file)
         self._angle = calculate_unit_scale(file, "PLANEANGLEUNIT")
+        profile = profile_in(results)
+        self._tolerances = None if profile is None else profile.title
         self._scans, self._dates = scans_in_words(results), file.schema != "IFC2X3"
 
     def write(self, product: Any, element: ElementEntry, found: DetectionEntry | None, *, moved: bool) -> None:

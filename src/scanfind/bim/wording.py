@@ -83,8 +83,6 @@ def description(results: Results, element: ElementEntry) -> str:
         lines.append(f"Shift of its middle: x {x:+z.1f}, y {y:+z.1f}, z {z:+z.1f} mm; turned by {turn:.2f}°.")
     if why := element.verdict_why:
         lines.append(f"{why[:1].upper()}{why[1:]}.")
-    elif results.allowed_m is not None and element.verdict is not None:
-        lines.append(f"Allowed: {1e3 * results.allowed_m:g} mm.")
     lines.append(f"Scans: {scans_in_words(results)}; inspected {results.made or 'at an unknown time'}.")
     return "\n".join(lines)
 

@@ -182,12 +182,12 @@ class ElementEntry(Entry):
 
     `status`: installed, uncertain, occluded, not_found, not_enough_data or no_data. `verdict`: in_tolerance,
     out_of_tolerance or not_judged, `verdict_why` in words; null where it was not found or there is no `profile`.
-    `detection`: the id of the instance taken for it. `shift_m` of its middle, in the scan's axes, `turn_rad` by what angle it is turned, `off_m` how far the
-    point of its surface that moved the most did; all null where it was not found. `on`, `beside`, `through`, `hidden`:
-    what beams say at the design's place, as shares of the surface they went to: they ended on it, near it but not on
-    it, behind it, before it; null where no scanner position is known. `built_from_design` moves it from its place in
-    the design to where it stands, without the motions the scan hardly fixes: null unless it is installed, and in
-    results of an earlier version.
+    `detection`: the id of the instance taken for it. `shift_m` of its middle, in the scan's axes, `turn_rad` by what
+    angle it is turned, `off_m` how far the point of its surface that moved the most did; all null where it was not
+    found. `on`, `beside`, `through`, `hidden`: what beams say at the design's place, as shares of the surface they went
+    to: they ended on it, near it but not on it, behind it, before it; null where no scanner position is known.
+    `built_from_design` moves it from its place in the design to where it stands, without the motions the scan hardly
+    fixes: null unless it is installed, and in results of an earlier version.
     """
 
     global_id: str
@@ -232,9 +232,9 @@ class Results(Entry):
 
     `tolerance_m` is within which points were isolated, null where they were not. `elements` are those of the design,
     where a search was asked what became of it; `profile` by how much they may be off, as a TOML file says it (see
-    docs/report.md). `allowed_m` says so in results of an earlier version: no point of theirs by more. `made`: when this was written,
-    UTC as in 2026-11-22T17:30:00Z, null in results of an earlier version. `alignment`: null where scans and design are
-    in one frame.
+    docs/report.md). `allowed_m` says so in results of an earlier version: no point of theirs by more. `made`: when this
+    was written, UTC as in 2026-11-22T17:30:00Z, null in results of an earlier version. `alignment`: null where scans
+    and design are in one frame.
     """
 
     schema_: int = Field(SCHEMA, alias="schema")

@@ -89,7 +89,7 @@ class Profile:
         return {"title": self.title, "rule": rules}
 
 
-def allowed(what: float | str | PathLike[str] | Profile) -> Profile:
+def profile_allowing(what: float | str | PathLike[str] | Profile) -> Profile:
     """What may be said of how far elements may be off: a length in metres, a preset's name, a TOML file, a profile.
 
     Raises UsageError for a length that is none, and as `load_profile` does.
