@@ -164,6 +164,17 @@ def test_every_element_has_the_status_it_should(inspected: scanfind.Findings) ->
     assert len(inspected) == 2
 
 
+def test_what_each_station_says_adds_up_to_what_all_say(inspected: scanfind.Findings) -> None:
+    for element in inspected.elements:
+        assert {each.station for each in element.stations} <= {1, 2}
+        said = np.sum([each[1:] for each in element.stations], axis=0)
+        # A station that speaks of less than a hundredth is left out.
+        shares = (element.on, element.beside, element.through, element.hidden)
+        np.testing.assert_allclose(said, np.array(shares, np.float64), atol=0.01)
+    for found in inspected:
+        assert sum(sum(each[1:]) for each in found.stations) == pytest.approx(1.0, abs=0.01)
+
+
 def test_displacements_are_measured(inspected: scanfind.Findings) -> None:
     here, off = inspected.elements[:2]
     assert here.off_m is not None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +105,19 @@ class IsolatedPoints:
         return len(self.xyz)
 
 
+class StationSays(NamedTuple):
+    """What the beams of one station say of a placed model, as shares of the surface that those of all went to.
+
+    station : its number, from 1, among those of all scans in order; the others : see free_space.Spoken
+    """
+
+    station: int
+    on: float
+    beside: float
+    through: float
+    hidden: float
+
+
 @dataclass(frozen=True, eq=False)
 class Detection:
     """One instance of one model, as found.
@@ -122,6 +135,7 @@ class Detection:
         of `unobservable` without a sigma. None in results of a version that had none
     pivot : (3,) the point the covariance is about, in the middle of the placed model, scene frame, metres
     parts : of an assembly, each measured by itself; empty where that was not asked for or it has but one
+    stations : what each station says of it; empty where there are not several
     """
 
     id: int
@@ -139,6 +153,7 @@ class Detection:
     covariance: Floats | None = None
     pivot: tuple[float, float, float] | None = None
     parts: tuple[PartFit, ...] = ()
+    stations: tuple[StationSays, ...] = ()
 
     @property
     def sigma_m(self) -> float:
@@ -205,3 +220,8 @@ class Findings(list[Detection]):
         self.refused, self.scans, self.notes, self.elements, self.missing = [], [], [], [], []
         self.shift, self.crs, self.timings_s, self.tolerance_m = (0.0, 0.0, 0.0), None, {}, None
         self.profile, self.alignment = None, None
+
+    def stations(self) -> Floats:
+        """Where the scanners of all scans stood, in order, (S, 3); NaN where nobody knows."""
+        nowhere = (np.nan,) * 3
+        return np.array([where or nowhere for scan in self.scans for where in scan.stations]).reshape(-1, 3)

@@ -120,10 +120,13 @@ def find(
             findings[:] = [
                 one if one.parts else polished(one, surfaces[one.model], parameters.refine, jobs) for one in findings
             ]
-    if at_design:
-        with clock("verify"):
-            findings.elements = found.elements(findings)
     findings.scans = [source.told() for source in sources.all]
+    with clock("verify"):
+        stations = findings.stations()
+        if len(stations) > 1:
+            findings[:] = [found.with_stations(one, stations) for one in findings]
+        if at_design:
+            findings.elements = found.elements(findings, stations)
     findings.crs, findings.notes = sources.crs(), found.notes()
     findings.shift = found.shift()
     findings.timings_s = clock.timings()

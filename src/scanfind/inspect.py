@@ -131,4 +131,4 @@ def retold(element: Element, model: Model, findings: Findings, correction: Pose)
         return replace(element, placement=place)
     shares = element.on, element.beside, element.through, element.hidden
     spoken = None if None in shares else Spoken(*(share or 0.0 for share in shares))
-    return installed(model, place, found, spoken)
+    return replace(installed(model, place, found, spoken), stations=element.stations)

@@ -8,12 +8,14 @@ not there), `not_enough_data` (too little of it was looked at), `no_data` (no be
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.detection import StationSays
+from scanfind.evidence.free_space import Spoken
 from scanfind.fit.refine import held
 from scanfind.mesh import Placement
 from scanfind.pose import Pose
@@ -21,7 +23,6 @@ from scanfind.symmetry import pose_error
 
 if TYPE_CHECKING:
     from scanfind.detection import Detection
-    from scanfind.evidence.free_space import Spoken
     from scanfind.library.model import Model
 
 Floats = NDArray[np.float64]
@@ -39,6 +40,7 @@ MAY_BE, IS_NOT = 0.5, 0.7
 FAR_M = 0.5
 SAID_M = 0.002  # what a motion that is held at the design's would add is told from here on
 IN_TOLERANCE, OUT_OF_TOLERANCE, NOT_JUDGED = "in_tolerance", "out_of_tolerance", "not_judged"
+LEAST_SAID = 0.01  # of the surface that beams went to: a station that speaks of less is not told
 PAIRED_BY = 50  # samples, which lie evenly over the model: they tell which of two places is nearer
 
 
@@ -57,6 +59,7 @@ class Element:
     why : the evidence in words
     built_from_design : what moves it from its place in the design to where it stands, in the design's axes about their
         origin; without the motions the scan hardly fixes. None unless installed
+    stations : what each station says of its place in the design; empty where there are not several
     verdict, verdict_why : in_tolerance, out_of_tolerance or not_judged, and why (see `scanfind.tolerances`); None
         unless it is installed and somebody said how far off it may be
     """
@@ -76,6 +79,7 @@ class Element:
     built_from_design: Pose | None = None
     verdict: str | None = None
     verdict_why: str = ""
+    stations: tuple[StationSays, ...] = ()
 
 
 def placements_of(model: Model) -> tuple[Placement, ...]:
@@ -84,18 +88,21 @@ def placements_of(model: Model) -> tuple[Placement, ...]:
 
 
 def elements_of(
-    model: Model, detections: Sequence[Detection], spoken_at: Callable[[Pose], Spoken | None]
+    model: Model, detections: Sequence[Detection], spoken_at: Callable[[Pose], Floats], stations: Sequence[int] = ()
 ) -> list[Element]:
     """The elements of a design that are of one model, in the order of its placements.
 
     detections : in the scans' frame, which is the design's
-    spoken_at : what beams say of the model at a pose; None where no scanner position is known
+    spoken_at : what the beams of each of S scanners say of the model at a pose: rows as of Spoken, (S, 4), m²
+    stations : their numbers
     """
     placements, found = placements_of(model), []
     taken = assigned(model, placements, [one for one in detections if one.model == model.name])
     for place, placement in enumerate(placements):
-        spoken, one = spoken_at(placement.design_from_model), taken.get(place)
-        found.append(missed(model, placement, spoken) if one is None else installed(model, placement, one, spoken))
+        by_each, one = spoken_at(placement.design_from_model), taken.get(place)
+        spoken = Spoken(*by_each.sum(axis=0).tolist()) if len(by_each) else None
+        told = missed(model, placement, spoken) if one is None else installed(model, placement, one, spoken)
+        found.append(replace(told, stations=said_by(by_each, stations)))
     return found
 
 
@@ -171,6 +178,15 @@ def missed(model: Model, placement: Placement, spoken: Spoken | None) -> Element
     """An element that was not found, and what its place in the design looks like."""
     status, why = status_at(spoken, model.exposed_area())
     return Element(placement, model.name, status, None, None, None, None, *shares(spoken), why)
+
+
+def said_by(by_each: Floats, stations: Sequence[int]) -> tuple[StationSays, ...]:
+    """What each of S stations says, (S, 4) m², as shares of what all went to; none of one station alone."""
+    if len(by_each) < 2:
+        return ()
+    parts = by_each / max(by_each.sum(), 1e-300)
+    told = zip(stations, parts.tolist(), strict=True)
+    return tuple(StationSays(number, *part) for number, part in told if sum(part) >= LEAST_SAID)
 
 
 def shares(spoken: Spoken | None) -> tuple[float | None, float | None, float | None, float | None]:

@@ -73,9 +73,14 @@ def caster_of(model: Model) -> RayCaster:
 
 def spoken_of(model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams], limits: Limits) -> Spoken:
     """What the beams of all scanners say of a model placed by scene_from_model, relative to the grid's offset."""
+    return Spoken(*spoken_by_each(model, caster, placed, scanners, limits).sum(axis=0).tolist())
+
+
+def spoken_by_each(model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams], limits: Limits) -> Floats:
+    """What the beams of each of S scanners say: rows as of `Spoken`, (S, 4), m²."""
     beams = towards(model, placed, scanners)
     if not len(beams.ranges):
-        return Spoken(0.0, 0.0, 0.0, 0.0)
+        return np.zeros((len(scanners), 4))
     back = placed.inverse()
     origins, directions = back.move(beams.origins), beams.directions @ placed.rotation
     hits = caster.shoot(origins, directions)
@@ -90,16 +95,18 @@ def spoken_of(model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[
     edge = np.zeros(len(met), np.bool_)
     edge[passed[~deep]] = True
     beside = ~(on | through | hidden)
-    return Spoken(*(float(area[which & ~edge].sum()) for which in (on, beside, through, hidden)))
+    whose, said = beams.scanner[met], [each & ~edge for each in (on, beside, through, hidden)]
+    return np.stack([np.bincount(whose[each], area[each], len(scanners)) for each in said], axis=1)
 
 
 class Towards(NamedTuple):
-    """Beams that go towards a model: origins, directions (B, 3), ranges, solid angles of their pixels (B,)."""
+    """Beams that go towards a model: origins, directions (B, 3), ranges, solid angles of their pixels, whose (B,)."""
 
     origins: Floats
     directions: Floats
     ranges: Floats
     angles: Floats
+    scanner: NDArray[np.intp]
 
     def ends(self) -> Floats:
         """Where they ended, (B, 3)."""
@@ -116,14 +123,15 @@ def towards(model: Model, placed: Pose, scanners: Sequence[Beams]) -> Towards:
         count = pixels_towards(points, scanner.origin, reach, scanner.edge, scanner.nearest, met, found)
         pixels.append(found[:count])
     share = min(1.0, MOST_BEAMS / max(sum(map(len, pixels)), 1))
-    asked_for = [Towards(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))]
-    for scanner, some in zip(scanners, pixels, strict=True):
+    asked_for = [Towards(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, np.intp))]
+    for number, (scanner, some) in enumerate(zip(scanners, pixels, strict=True)):
         asked = some[lots(some) < share]
         directions, ranges, angles = np.empty((len(asked), 3)), np.empty(len(asked)), np.empty(len(asked))
         beams_of(asked, scanner.nearest, scanner.edge, directions, ranges, angles)
         # Each of those asked stands for as many as were left out.
         origins = np.broadcast_to(scanner.origin, directions.shape)
-        asked_for.append(Towards(origins, directions, ranges, angles / share))
+        whose = np.full(len(asked), number)
+        asked_for.append(Towards(origins, directions, ranges, angles / share, whose))
     return Towards(*(np.concatenate(column) for column in zip(*asked_for, strict=True)))
 
 

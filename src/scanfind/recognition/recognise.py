@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.assembly import Assemblies, Explained, View
-from scanfind.design.elements import LEAST_LOOKED_AT, Element, elements_of, placements_of
+from scanfind.design.elements import LEAST_LOOKED_AT, Element, elements_of, placements_of, said_by
 from scanfind.detection import Detection, Motion, Refused
-from scanfind.evidence.free_space import Limits, Spoken, caster_of, spoken_of, towards
+from scanfind.evidence.free_space import Limits, Spoken, caster_of, spoken_by_each, towards
 from scanfind.evidence.verify import (
     Evidence,
     Level,
@@ -337,9 +337,13 @@ class Recognition:
 
     def _spoken_of(self, number: int, placed: Pose) -> Spoken:
         """What beams say of a model at a pose relative to the grid's offset."""
+        return Spoken(*self._spoken_by_each(number, placed).sum(axis=0).tolist())
+
+    def _spoken_by_each(self, number: int, placed: Pose) -> Floats:
+        """What the beams of each of S scanners say, rows as of Spoken, (S, 4)."""
         verify, level = self.parameters.verify, self._fine
         limits = Limits(level.inlier, level.margin(verify), verify.least_facing)
-        return spoken_of(self.models[number], self._caster(number), placed, self.scene.beams, limits)
+        return spoken_by_each(self.models[number], self._caster(number), placed, self.scene.beams, limits)
 
     def _caster(self, number: int) -> RayCaster:
         """The surface of a model, made ready for beams when first asked for."""
@@ -579,14 +583,28 @@ class Recognition:
             parts=whole.parts if whole else (),
         )  # fmt: skip
 
-    def elements(self, number: int, detections: Sequence[Detection]) -> list[Element]:
-        """What became of each element of the design that is of a model; detections : as they are reported."""
-        offset = self.scene.fine.cells.offset
+    def elements(self, number: int, detections: Sequence[Detection], stations: Floats) -> list[Element]:
+        """What became of each element of the design that is of a model.
 
-        def spoken_at(design: Pose) -> Spoken | None:
-            return None if self.blind else self._spoken_of(number, Pose(design.rotation, design.translation - offset))
+        detections : as they are reported; stations : where all of them stood, in order, (S, 3)
+        """
+        return elements_of(
+            self.models[number], detections, lambda pose: self._said_at(number, pose), self._numbers(stations)
+        )
 
-        return elements_of(self.models[number], detections, spoken_at)
+    def with_stations(self, number: int, found: Detection, stations: Floats) -> Detection:
+        """A detection of a model with what each station says of it; stations : see `elements`."""
+        said = self._said_at(number, found.scene_from_model)
+        return replace(found, stations=said_by(said, self._numbers(stations)))
+
+    def _said_at(self, number: int, pose: Pose) -> Floats:
+        """What the beams of each scanner say of a model at a pose in the scans' own frame: see `_spoken_by_each`."""
+        return self._spoken_by_each(number, Pose(pose.rotation, pose.translation - self.scene.fine.cells.offset))
+
+    def _numbers(self, stations: Floats) -> list[int]:
+        """Of each scanner the number, from 1, of the station that stood where it did."""
+        stood = [scanner.origin + self.scene.fine.cells.offset for scanner in self.scene.beams]
+        return [1 + int(np.nanargmin(np.linalg.norm(stations - where, axis=1))) for where in stood]
 
     def reach(self) -> float:
         """How far from its surface points of an instance may lie, metres."""

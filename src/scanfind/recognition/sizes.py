@@ -119,10 +119,16 @@ class Sizes:
         """A detection with its parts fitted to raw points (N, 3) around it, scan frame; None: it has no parts."""
         return found if points is None else self._of(found.model).measured(found, points)
 
-    def elements(self, detections: Sequence[Detection]) -> list[Element]:
-        """What became of each element of the design, in the order of the models."""
+    def with_stations(self, found: Detection, stations: Floats) -> Detection:
+        """A detection with what each station says of it; stations : where all of them stood, in order, (S, 3)."""
+        search = self._of(found.model)
+        number = next(number for number, model in enumerate(search.models) if model.name == found.model)
+        return search.with_stations(number, found, stations)
+
+    def elements(self, detections: Sequence[Detection], stations: Floats) -> list[Element]:
+        """What became of each element of the design, in the order of the models; stations : see `with_stations`."""
         told = {
-            model.name: search.elements(number, detections)
+            model.name: search.elements(number, detections, stations)
             for search in self.all
             for number, model in enumerate(search.models)
         }

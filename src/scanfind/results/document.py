@@ -18,7 +18,7 @@ from pydantic_core import to_jsonable_python
 from scanfind.clock import STAGES
 from scanfind.design.alignment import Alignment
 from scanfind.design.elements import Element
-from scanfind.detection import Detection, Deviation, Findings, Motion, PartFit, Refused, SceneScan
+from scanfind.detection import Detection, Deviation, Findings, Motion, PartFit, Refused, SceneScan, StationSays
 from scanfind.mesh import Placement
 from scanfind.pose import Pose
 from scanfind.results import schema
@@ -168,6 +168,7 @@ def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -
         sigma_m=_or_none(found.sigma_m),
         sigma_rad=_or_none(found.sigma_rad),
         parts=[_part_entry(part) for part in found.parts],
+        stations=_station_entries(found.stations),
     )
 
 
@@ -231,6 +232,7 @@ def _element_entry(element: Element) -> schema.ElementEntry:
         status=element.status,
         verdict=element.verdict,
         verdict_why=element.verdict_why,
+        stations=_station_entries(element.stations),
         detection=element.detection,
         design_from_model=rows(placement.design_from_model),
         shift_m=element.shift_m,
@@ -243,6 +245,10 @@ def _element_entry(element: Element) -> schema.ElementEntry:
         why=element.why,
         built_from_design=None if element.built_from_design is None else rows(element.built_from_design),
     )
+
+
+def _station_entries(stations: Iterable[StationSays]) -> list[schema.StationEntry]:
+    return [schema.StationEntry(**each._asdict()) for each in stations]
 
 
 def _alignment_entry(alignment: Alignment) -> schema.AlignmentEntry:
@@ -291,7 +297,12 @@ def _detection(entry: schema.DetectionEntry) -> Detection:
         covariance=None if entry.covariance is None else np.array(entry.covariance),
         pivot=entry.pivot_m,
         parts=tuple(_part(part) for part in entry.parts),
+        stations=_stations(entry.stations),
     )
+
+
+def _stations(entries: Iterable[schema.StationEntry]) -> tuple[StationSays, ...]:
+    return tuple(StationSays(**entry.model_dump()) for entry in entries)
 
 
 def _motions(entries: Iterable[schema.MotionEntry]) -> tuple[Motion, ...]:
@@ -324,6 +335,7 @@ def _element(entry: schema.ElementEntry) -> Element:
     return Element(
         placement, entry.model, entry.status, entry.detection, entry.shift_m, entry.turn_rad, entry.off_m, entry.on,
         entry.beside, entry.through, entry.hidden, entry.why, moved, entry.verdict, entry.verdict_why,
+        _stations(entry.stations),
     )  # fmt: skip
 
 

@@ -126,6 +126,20 @@ class PartEntry(Entry):
     penalty: float | None
 
 
+class StationEntry(Entry):
+    """What the beams of one station say of a placed model, as shares of the surface that those of all went to.
+
+    `station`: its number, from 1, among the `stations_m` of all scans in order. Stations that went to less than a
+    hundredth are left out.
+    """
+
+    station: int
+    on: float
+    beside: float
+    through: float
+    hidden: float
+
+
 class DetectionEntry(Entry):
     """One instance of one model. `isolated` and `pose` are files of the result folder, null where none was written.
 
@@ -137,7 +151,8 @@ class DetectionEntry(Entry):
     much the pivot and the rotation are off, root mean square. All four are null in results of an earlier version.
 
     `parts` is empty where they were not asked for (`assembly.parts`, --parts) and where the model has but one. With
-    parts, `isolated` and `deviation` are of the parts where they were built.
+    parts, `isolated` and `deviation` are of the parts where they were built. `stations`: of where it was found; empty
+    where there are not several.
     """
 
     id: int
@@ -161,6 +176,7 @@ class DetectionEntry(Entry):
     sigma_m: float | None = None
     sigma_rad: float | None = None
     parts: list[PartEntry] = []
+    stations: list[StationEntry] = []
 
 
 class RefusedEntry(Entry):
@@ -187,7 +203,8 @@ class ElementEntry(Entry):
     found. `on`, `beside`, `through`, `hidden`: what beams say at the design's place, as shares of the surface they went
     to: they ended on it, near it but not on it, behind it, before it; null where no scanner position is known.
     `built_from_design` moves it from its place in the design to where it stands, without the motions the scan hardly
-    fixes: null unless it is installed, and in results of an earlier version.
+    fixes: null unless it is installed, and in results of an earlier version. `stations`: of the design's place; empty
+    where there are not several.
     """
 
     global_id: str
@@ -208,6 +225,7 @@ class ElementEntry(Entry):
     why: str
     built_from_design: Matrix | None = None
     verdict_why: str = ""
+    stations: list[StationEntry] = []
 
 
 class AlignmentEntry(Entry):
