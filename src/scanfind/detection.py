@@ -136,6 +136,9 @@ class Detection:
     pivot : (3,) the point the covariance is about, in the middle of the placed model, scene frame, metres
     parts : of an assembly, each measured by itself; empty where that was not asked for or it has but one
     stations : what each station says of it; empty where there are not several
+    slide : (3,) unit direction along which beams that went past its ends, not its faces, say where it stands; None
+        where none was asked or none could
+    instead_of : the element in whose place it stands, where two were swapped; else empty
     """
 
     id: int
@@ -154,6 +157,8 @@ class Detection:
     pivot: tuple[float, float, float] | None = None
     parts: tuple[PartFit, ...] = ()
     stations: tuple[StationSays, ...] = ()
+    slide: tuple[float, float, float] | None = None
+    instead_of: str = ""
 
     @property
     def sigma_m(self) -> float:

@@ -27,13 +27,14 @@ from scanfind.library.near_surface import near_model, near_triangles
 from scanfind.mesh import Mesh
 from scanfind.parameters import PRESETS, IsolationParameters, Parameters
 from scanfind.pose import Pose
-from scanfind.recognition.recognise import Recognition
+from scanfind.recognition.recognise import Recognition, design_of
 from scanfind.recognition.sizes import Sizes
 from scanfind.scans.sources import Scan, Sources, require_points
 from scanfind.threads import available_cores
 
 if TYPE_CHECKING:
     from scanfind.detection import Detection
+    from scanfind.evidence.free_space import Design
     from scanfind.kernels.distance import NearSurface
     from scanfind.progress import Progress
     from scanfind.recognition.recognise import Standing
@@ -96,8 +97,13 @@ def find(
             grid.add(chunk)
         require_points(sources)
 
+    design = design_of(library) if at_design else None
     for size in found.groups():  # large models first, each size at its own resolution
-        found.add(recognise(size, grid, found.standing(), parameters, seed, jobs, clock, tell, at_design=at_design))
+        found.add(
+            recognise(
+                size, grid, found.standing(), parameters, seed, jobs, clock, tell, at_design=at_design, design=design
+            )
+        )
     del grid
     tell("search", 1.0, 1.0)
 
@@ -123,6 +129,8 @@ def find(
     findings.scans = [source.told() for source in sources.all]
     with clock("verify"):
         stations = findings.stations()
+        if at_design:
+            findings[:] = found.with_ends(findings)
         if len(stations) > 1:
             findings[:] = [found.with_stations(one, stations) for one in findings]
         if at_design:
@@ -135,18 +143,18 @@ def find(
 
 def recognise(
     size: Size, grid: MomentGrid, standing: Sequence[Standing], parameters: Parameters, seed: int, jobs: int,
-    clock: Clock, tell: Progress, *, at_design: bool,
+    clock: Clock, tell: Progress, *, at_design: bool, design: Design | None = None,
 ) -> Recognition:  # fmt: skip
     """The search for models of one size: what is believed of them, and why (paper 3.3 and 3.4).
 
-    standing : instances of larger models
+    standing : instances of larger models; at_design : try them where the design has them first; design : all of it
     """
     with clock("grid"):
         smallest = min(model.diameter for model in size.models)
         scene = build_scene(grid, smallest, parameters.grid, parameters.search.test_cells_across, jobs)
     with clock("library"):
         table = joint_table(size.models, each_once=parameters.search.each_once)
-    found = Recognition(scene, size.models, table, parameters, seed, jobs, standing)
+    found = Recognition(scene, size.models, table, parameters, seed, jobs, standing, design)
     for hypotheses in found.at_design() if at_design else ():
         with clock("refine"):
             poses = found.refine_in_place(hypotheses)

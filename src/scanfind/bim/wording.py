@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scanfind.design.elements import INSTALLED, OUT_OF_TOLERANCE
+from scanfind.design.elements import FAR_M, INSTALLED, OUT_OF_TOLERANCE
 from scanfind.errors import UsageError
 from scanfind.library import ModelLibrary
 from scanfind.pose import Pose
@@ -65,8 +65,9 @@ def in_design(results: Results) -> Results:
 
 
 def is_finding(element: ElementEntry) -> bool:
-    """Does somebody have to look at it? Not where it is installed and nobody says it is out of tolerance."""
-    return element.status != INSTALLED or element.verdict == OUT_OF_TOLERANCE
+    """Does somebody have to look at it? Not where it is installed, in no other place, and not out of tolerance."""
+    elsewhere = element.off_m is not None and element.off_m > FAR_M
+    return element.status != INSTALLED or elsewhere or element.verdict == OUT_OF_TOLERANCE
 
 
 def title(element: ElementEntry) -> str:

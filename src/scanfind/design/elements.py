@@ -40,6 +40,8 @@ MAY_BE, IS_NOT = 0.5, 0.7
 FAR_M = 0.5
 SAID_M = 0.002  # what a motion that is held at the design's would add is told from here on
 IN_TOLERANCE, OUT_OF_TOLERANCE, NOT_JUDGED = "in_tolerance", "out_of_tolerance", "not_judged"
+# A motion fixed so much worse than others on average is asked of the ends; and so much of it must be a slide.
+OPEN, SLIDES = 0.1, 0.5
 LEAST_SAID = 0.01  # of the surface that beams went to: a station that speaks of less is not told
 PAIRED_BY = 50  # samples, which lie evenly over the model: they tell which of two places is nearer
 
@@ -137,11 +139,13 @@ def installed(model: Model, placement: Placement, found: Detection, spoken: Spok
     x, y, z = (stands.move(centre) - design.move(centre))[0].tolist()
     turn = pose_error(stands, design, model.symmetry).rotation_rad
     off = off_by(model, model.samples.points, stands, design)
-    if off > FAR_M:
+    if off > FAR_M and not found.instead_of:
         _, there = status_at(spoken, model.exposed_area())
         why = f"where it should be {there}; one of its shape stands {off:.2f} m off"
         return Element(placement, model.name, UNCERTAIN, found.id, (x, y, z), turn, off, *shares(spoken), why)
     why = f"found with score {found.score:.2f}: {found.coverage:.0%} of its surface lies on the scan"
+    if found.instead_of:
+        why = f"{why}; it stands in the place of {found.instead_of}"
     further = off_by(model, model.samples.points, found.scene_from_model, design) - off
     if further > SAID_M:
         why += f"; {1e3 * further:.0f} mm more, along a motion the scan hardly fixes, are left out"
@@ -152,14 +156,27 @@ def installed(model: Model, placement: Placement, found: Detection, spoken: Spok
 def drawn_back(model: Model, found: Detection, design: Pose) -> Pose:
     """Where an element stands, as designed along the motions that the scan hardly fixes."""
     alike = model.symmetry.nearest(found.scene_from_model, design.rotation)
-    if found.covariance is None or found.pivot is None:
+    if found.covariance is None or found.pivot is None or found.instead_of:
         return alike
     middle = found.scene_from_model.inverse().move(np.array(found.pivot)[None])
     radius = 0.5 * model.diameter
     information = information_of(found, radius)
+    if found.slide is not None:  # its ends say it, however little its faces do
+        along = np.concatenate([np.zeros(3), found.slide])
+        information = information + np.trace(information) / 6.0 * np.outer(along, along)
     # The pivot is in the middle of what was seen; a symmetry may have turned that elsewhere.
     there = alike.inverse().move(found.scene_from_model.move(middle))[0]
     return held(design, alike, information, there, radius)
+
+
+def open_slide(model: Model, found: Detection) -> Floats | None:
+    """The direction (3,) of a slide that the faces of an instance leave open, scan axes; None where there is none."""
+    values, motions = np.linalg.eigh(information_of(found, 0.5 * model.diameter))
+    for value, motion in zip(values, motions.T, strict=True):
+        share = np.linalg.norm(motion[3:])
+        if value < OPEN * values.mean() and share > SLIDES:
+            return np.asarray(motion[3:] / share)
+    return None
 
 
 def information_of(found: Detection, radius: float) -> Floats:

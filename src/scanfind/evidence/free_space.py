@@ -49,11 +49,35 @@ class Limits(NamedTuple):
     inlier : it met the surface if it ended within so many metres of it, across it
     margin : it passed through if it went on so many metres farther
     facing : least cosine to the surface's normal; a beam that grazes it may bring nothing back
+    edge : a beam so near to the outline says nothing if it went on, metres; 0: `inlier`
     """
 
     inlier: float
     margin: float
     facing: float
+    edge: float = 0.0
+
+
+class Design(NamedTuple):
+    """All elements where the design has them: what a beam met of them hides what it would have met behind.
+
+    caster : in the scans' own frame; models : name of the model of each mesh in it
+    """
+
+    caster: RayCaster
+    models: tuple[str, ...]
+
+    def hides(self, model: str, beams: Towards, distance: Floats, inlier: float) -> NDArray[np.bool_]:
+        """Which beams ended on another element of the design before they could have met a model, `distance` (B,) off.
+
+        Steel lies on steel: a plate of 10 mm on a flange is nearer to it than beams of free space tell apart.
+        """
+        hits = self.caster.shoot(beams.origins, beams.directions)
+        other = np.array([name != model for name in self.models])[hits.owner]
+        # Half a millimetre: faces that lie on each other hide nothing of each other.
+        first = np.isfinite(hits.distance) & other & (hits.distance < distance - 5e-4)
+        off = np.abs(beams.ranges - np.where(first, hits.distance, 0.0)) * hits.cosine
+        return np.asarray(first & (off <= inlier))
 
 
 def caster_of(model: Model) -> RayCaster:
@@ -76,8 +100,14 @@ def spoken_of(model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[
     return Spoken(*spoken_by_each(model, caster, placed, scanners, limits).sum(axis=0).tolist())
 
 
-def spoken_by_each(model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams], limits: Limits) -> Floats:
-    """What the beams of each of S scanners say: rows as of `Spoken`, (S, 4), m²."""
+def spoken_by_each(
+    model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams], limits: Limits,
+    design: Design | None = None, offset: Floats | None = None,
+) -> Floats:  # fmt: skip
+    """What the beams of each of S scanners say: rows as of `Spoken`, (S, 4), m².
+
+    design, offset : of a model that is in its place in it, what hides it there; the grid's offset, (3,)
+    """
     beams = towards(model, placed, scanners)
     if not len(beams.ranges):
         return np.zeros((len(scanners), 4))
@@ -91,10 +121,21 @@ def spoken_by_each(model: Model, caster: RayCaster, placed: Pose, scanners: Sequ
     on = np.abs(ranges - distance) * cosine <= limits.inlier
     # A beam a hair within the outline says nothing: the pose is no better than that.
     passed = np.flatnonzero(through)
-    deep = within(caster, origins[met[passed]], directions[met[passed]], ranges[passed] - limits.margin, limits.inlier)
+    deep = within(
+        caster,
+        origins[met[passed]],
+        directions[met[passed]],
+        ranges[passed] - limits.margin,
+        limits.edge or limits.inlier,
+    )
     edge = np.zeros(len(met), np.bool_)
     edge[passed[~deep]] = True
     beside = ~(on | through | hidden)
+    if design is not None and beside.any():
+        some = np.flatnonzero(beside)
+        theirs = beams.take(met[some]).moved(np.zeros(3) if offset is None else offset)
+        behind = some[design.hides(model.name, theirs, distance[some], limits.inlier)]
+        beside[behind], hidden[behind] = False, True
     whose, said = beams.scanner[met], [each & ~edge for each in (on, beside, through, hidden)]
     return np.stack([np.bincount(whose[each], area[each], len(scanners)) for each in said], axis=1)
 
@@ -108,6 +149,16 @@ class Towards(NamedTuple):
     angles: Floats
     scanner: NDArray[np.intp]
 
+    def take(self, which: NDArray[np.intp]) -> Towards:
+        """Some of them."""
+        return Towards(
+            self.origins[which], self.directions[which], self.ranges[which], self.angles[which], self.scanner[which]
+        )
+
+    def moved(self, by: Floats) -> Towards:
+        """The same from elsewhere, (3,)."""
+        return self._replace(origins=self.origins + by)
+
     def ends(self) -> Floats:
         """Where they ended, (B, 3)."""
         return self.origins + self.directions * self.ranges[:, None]
@@ -115,14 +166,19 @@ class Towards(NamedTuple):
 
 def towards(model: Model, placed: Pose, scanners: Sequence[Beams]) -> Towards:
     """The beams that go towards a placed model, MOST_BEAMS of them where there are more."""
+    return beams_to(placed.move(model.samples.points), model.spacing, scanners, MOST_BEAMS)
+
+
+def beams_to(points: Floats, spacing: float, scanners: Sequence[Beams], most: float = np.inf) -> Towards:
+    """The beams that go by points (N, 3) within their spacing, metres; `most` of them where there are more."""
     from scanfind.kernels.beams import beams_of, pixels_towards
 
-    points, reach, pixels = placed.move(model.samples.points), REACH_SPACINGS * model.spacing, []
+    reach, pixels = REACH_SPACINGS * spacing, []
     for scanner in scanners:
         met, found = np.zeros(len(scanner.nearest), np.bool_), np.empty(len(scanner.nearest), np.int64)
         count = pixels_towards(points, scanner.origin, reach, scanner.edge, scanner.nearest, met, found)
         pixels.append(found[:count])
-    share = min(1.0, MOST_BEAMS / max(sum(map(len, pixels)), 1))
+    share = min(1.0, most / max(sum(map(len, pixels)), 1))
     asked_for = [Towards(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, np.intp))]
     for number, (scanner, some) in enumerate(zip(scanners, pixels, strict=True)):
         asked = some[lots(some) < share]

@@ -125,6 +125,16 @@ class Sizes:
         number = next(number for number, model in enumerate(search.models) if model.name == found.model)
         return search.with_stations(number, found, stations)
 
+    def with_ends(self, detections: Sequence[Detection]) -> list[Detection]:
+        """Detections, those that stand for an element slid to where beams say that their ends are."""
+        told = {
+            key: one
+            for search in self.all
+            for number in range(len(search.models))
+            for key, one in search.with_ends(number, detections).items()
+        }
+        return [told.get(one.id, one) for one in detections]
+
     def elements(self, detections: Sequence[Detection], stations: Floats) -> list[Element]:
         """What became of each element of the design, in the order of the models; stations : see `with_stations`."""
         told = {

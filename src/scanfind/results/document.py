@@ -169,6 +169,7 @@ def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -
         sigma_rad=_or_none(found.sigma_rad),
         parts=[_part_entry(part) for part in found.parts],
         stations=_station_entries(found.stations),
+        instead_of=found.instead_of,
     )
 
 
@@ -298,6 +299,7 @@ def _detection(entry: schema.DetectionEntry) -> Detection:
         pivot=entry.pivot_m,
         parts=tuple(_part(part) for part in entry.parts),
         stations=_stations(entry.stations),
+        instead_of=entry.instead_of,
     )
 
 

@@ -42,6 +42,8 @@ def element_sentences(results: Results, each: ElementEntry) -> tuple[str, ...]:
     if each.status == INSTALLED:
         sigma = None if found is None else found.sigma_rad
         there = (place_in_words(each, sigma), *(detection_sentences(results, found, of_design=True) if found else ()))
+        if found and found.instead_of:
+            there = f"It stands in the place of {found.instead_of}.", *there
         emptied = emptied_in_words(results, each, looked_from)
         return (*there, emptied) if emptied else there
     if each.detection is not None and each.off_m is not None:

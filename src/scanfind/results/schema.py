@@ -152,7 +152,8 @@ class DetectionEntry(Entry):
 
     `parts` is empty where they were not asked for (`assembly.parts`, --parts) and where the model has but one. With
     parts, `isolated` and `deviation` are of the parts where they were built. `stations`: of where it was found; empty
-    where there are not several.
+    where there are not several. `instead_of`: the element of the design in whose place it stands, where two were
+    swapped.
     """
 
     id: int
@@ -177,6 +178,7 @@ class DetectionEntry(Entry):
     sigma_rad: float | None = None
     parts: list[PartEntry] = []
     stations: list[StationEntry] = []
+    instead_of: str = ""
 
 
 class RefusedEntry(Entry):
