@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.evidence.free_space import Limits, beams_to
+from scanfind.evidence.free_space import Design, Limits, beams_to
 from scanfind.pose import Pose
 
 if TYPE_CHECKING:
@@ -41,12 +41,13 @@ class Slid(NamedTuple):
 
 def slid(
     model: Model, caster: RayCaster, placed: Pose, along: Floats, design: float, scanners: Sequence[Beams],
-    limits: Limits,
+    limits: Limits, neighbours: Design | None = None, offset: Floats | None = None,
 ) -> Slid | None:  # fmt: skip
     """How far a placed model has to slide for its ends to be where beams say; None where they do not refute the design.
 
     placed : scene_from_model, relative to the grid's offset; along : (3,) unit direction of the slide, scene axes
     design : where along it the design has the model, metres from `placed`
+    neighbours, offset : the whole design: what ended on others of it speaks for none; the grid's offset, (3,)
     """
     if abs(design) >= REACH_M:
         return None
@@ -66,6 +67,9 @@ def slid(
     every = np.arange(len(beams.ranges))
     said = np.stack([votes(step, every) for step in coarse])
     telling = np.flatnonzero((said != said[0]).any(axis=0))
+    if neighbours is not None:
+        theirs = beams.take(telling).moved(np.zeros(3) if offset is None else offset)
+        telling = telling[np.isinf(neighbours.met(model.name, theirs, limits.inlier))]
     if not len(telling):
         return None
     steps = np.arange(-REACH_M, REACH_M + 0.5 * FINE_M, FINE_M)

@@ -67,17 +67,13 @@ class Design(NamedTuple):
     caster: RayCaster
     models: tuple[str, ...]
 
-    def hides(self, model: str, beams: Towards, distance: Floats, inlier: float) -> NDArray[np.bool_]:
-        """Which beams ended on another element of the design before they could have met a model, `distance` (B,) off.
-
-        Steel lies on steel: a plate of 10 mm on a flange is nearer to it than beams of free space tell apart.
-        """
+    def met(self, model: str, beams: Towards, inlier: float) -> Floats:
+        """How far off beams ended on an element that is not of a model, (B,) metres; infinite where they did not."""
         hits = self.caster.shoot(beams.origins, beams.directions)
         other = np.array([name != model for name in self.models])[hits.owner]
-        # Half a millimetre: faces that lie on each other hide nothing of each other.
-        first = np.isfinite(hits.distance) & other & (hits.distance < distance - 5e-4)
+        first = np.isfinite(hits.distance) & other
         off = np.abs(beams.ranges - np.where(first, hits.distance, 0.0)) * hits.cosine
-        return np.asarray(first & (off <= inlier))
+        return np.where(first & (off <= inlier), hits.distance, np.inf)
 
 
 def caster_of(model: Model) -> RayCaster:
@@ -132,9 +128,11 @@ def spoken_by_each(
     edge[passed[~deep]] = True
     beside = ~(on | through | hidden)
     if design is not None and beside.any():
+        # Steel lies on steel: a plate of 10 mm on a flange is nearer to it than beams of free space tell apart. Half a
+        # millimetre: faces that lie on each other hide nothing of each other.
         some = np.flatnonzero(beside)
         theirs = beams.take(met[some]).moved(np.zeros(3) if offset is None else offset)
-        behind = some[design.hides(model.name, theirs, distance[some], limits.inlier)]
+        behind = some[design.met(model.name, theirs, limits.inlier) < distance[some] - 5e-4]
         beside[behind], hidden[behind] = False, True
     whose, said = beams.scanner[met], [each & ~edge for each in (on, beside, through, hidden)]
     return np.stack([np.bincount(whose[each], area[each], len(scanners)) for each in said], axis=1)

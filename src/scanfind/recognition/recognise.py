@@ -398,7 +398,7 @@ class Recognition:
         found, verify, claimed = self.candidates(refined, in_place=True), self.parameters.verify, self._no_rows()
         elsewhere, missed = [], []
         asked_all, moved_all = found[: len(found) // 2], found[len(found) // 2 :]
-        bests = [max(pair, key=lambda candidate: candidate.score) for pair in zip(moved_all, asked_all, strict=True)]
+        bests = [self._better_in_place(*pair) for pair in zip(moved_all, asked_all, strict=True)]
         swapped = {} if self.blind else self._swapped(bests)
         for k, (asked, best) in enumerate(zip(asked_all, bests, strict=True)):
             if k in swapped:
@@ -425,6 +425,11 @@ class Recognition:
                 self.believed.append(candidate)
                 self._claim(candidate, claimed)
         self._settled(claimed)
+
+    def _better_in_place(self, moved: Candidate, asked: Candidate) -> Candidate:
+        """Of a pose as the design gives it and as ICP leaves it the better; what was carried off only where it must be."""
+        best = max(moved, asked, key=lambda candidate: candidate.score)
+        return asked if self._apart(best, asked) > IN_PLACE_M and not self._why_not_in_place(asked) else best
 
     def _swapped(self, bests: Sequence[Candidate]) -> dict[int, Candidate]:
         """By number of the place what stands in it, where two elements stand in each other's.
@@ -459,8 +464,14 @@ class Recognition:
         pose = Pose(stands.rotation, stands.translation)
         ways = [pose @ way for way in onto(self.models[model], self.models[stands.model])]
         best = max(ways, key=lambda way: explained(self._spoken_of(model, way)))
-        [found] = self.candidates(self._icp_fine(self._placements(model, [best])), in_place=True)
-        return found._replace(instead_of=place)
+        start = self._placements(model, [best])
+        refined = self._icp_fine(start)
+        self._hold(refined, start)
+        asked, found = (
+            self.candidates(each, in_place=True)[0] for each in (refined._replace(hypotheses=start), refined)
+        )
+        better = asked if self._apart(found, asked) > IN_PLACE_M else found
+        return better._replace(instead_of=place)
 
     def _why_not_in_place(self, candidate: Candidate) -> str:
         """Why an element is not believed to stand where the design puts it; empty where it is."""
@@ -690,7 +701,10 @@ class Recognition:
         alike = model.symmetry.nearest(design, placed.rotation)
         from_here = float((alike.move(centre) - placed.move(centre))[0] @ along)
         here = Pose(placed.rotation, placed.translation - self.scene.fine.cells.offset)
-        told = slid(model, self._caster(number), here, along, from_here, self.scene.beams, self._limits())
+        told = slid(
+            model, self._caster(number), here, along, from_here, self.scene.beams, self._limits(), self._design,
+            self.scene.fine.cells.offset,
+        )  # fmt: skip
         if told is None:
             return found
         step, covariance = told.by * along, found.covariance.copy()
