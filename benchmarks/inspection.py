@@ -95,9 +95,12 @@ def main(
     with ModelLibrary.in_memory() as library:
         for model in models_of(meshes, scanfind.PRESETS["default"], None, ()):
             library.put(model)
-        rows = [row for seed in seeds_of(seeds) for row in rows_of(seed, meshes, library, int(points), time_limit)]
-    lines = summary(rows)
-    tell(lines, write_csv(name, rows, seeds, date, lines))
+        rows: list[Row] = []
+        for seed in seeds_of(seeds):
+            rows += rows_of(seed, meshes, library, int(points), time_limit)
+            lines, done = summary(rows), ",".join(dict.fromkeys(str(row.seed) for row in rows))
+            path = write_csv(name, rows, f"{done} of {seeds}", date, lines)  # a scene takes minutes: none is lost
+    tell(lines, path)
 
 
 def summary(rows: list[Row]) -> list[str]:
@@ -107,7 +110,7 @@ def summary(rows: list[Row]) -> list[str]:
         these = [row for row in rows if row.built == how]
         counts = Counter(row.status for row in these)
         told = ", ".join(f"{n} {status.replace('_', ' ')}" for status, n in counts.most_common())
-        lines.append(f"{how}: {len(these)} elements, {told}")
+        lines.append(f"{how}: {len(these)} elements, {told or 'none'}")
     still = [row.off_mm for row in rows if row.built == DESIGNED and row.status == INSTALLED]
     lines.append(f"as designed, told off: median {median(still):.1f} mm, largest {max(still, default=0.0):.1f} mm")
     seen = [row for row in rows if row.visible >= VISIBLE]
