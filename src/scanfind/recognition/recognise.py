@@ -427,7 +427,7 @@ class Recognition:
         self._settled(claimed)
 
     def _better_in_place(self, moved: Candidate, asked: Candidate) -> Candidate:
-        """Of a pose as the design gives it and as ICP leaves it the better; one carried off only where the other fails."""
+        """Of a pose as the design gives it and as ICP leaves it the better; one carried off only if the other fails."""
         best = max(moved, asked, key=lambda candidate: candidate.score)
         return asked if self._apart(best, asked) > IN_PLACE_M and not self._why_not_in_place(asked) else best
 
