@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 REACH_M = 0.15  # to either side: how far ICP may have slid, and an element may have been moved
 COARSE, FINE_M = 31, 0.001  # beams that say the same in all of so many places say nothing; then a millimetre a place
 # Were each beam that changes its mind between two places a coin, the difference would be within so many times the root
-# of their number. Of 57 elements that were not moved none but one at the end of the reach exceeded it.
+# of their number. Of the elements of a tuning scene that were not moved one exceeded it, along a neighbour's flange.
 SURE = 3.0
 FIXED = 3.0  # a slide of less than so many times its standard deviation is none
 
