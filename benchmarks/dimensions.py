@@ -16,6 +16,7 @@ from scanfind.detection import ANGLE, LINEAR, RADIUS
 from scanfind.dimensions import Plan, plan_of
 from scanfind.dimensions.fits import designed
 from scanfind.mesh import Mesh
+from scanfind.parameters import IsolationParameters, Parameters
 from scanfind.pose import Pose, random_rotation
 from scanfind.simulate.equipment import TOWARDS_X
 from scanfind.simulate.objects import RIGHT_ANGLE, Route
@@ -27,6 +28,7 @@ from scanfind.simulate.scene import Scene, SceneObject
 OF_FACETS = 1.0 - (np.pi / SIDES) ** 2 / 3.0
 MOST_LONG_M, MOST_ASKEW_DEG = 0.008, 1.0
 COVERED = {1.0: 0.68, 2.0: 0.95}
+MEASURING = Parameters(isolate=IsolationParameters(dimensions=True))
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ def rows_of(design: Mesh, seed: int, step: float) -> list[Row]:
     plan, drawn = plan_of(design), plan_of(built)
     told, true = values(plan), values(replace(plan, features=drawn.features))
     rows = []
-    for found in scanfind.find(scanned.stations, design, seed=seed)[:1]:
+    for found in scanfind.find(scanned.stations, design, parameters=MEASURING, seed=seed)[:1]:
         for one in found.dimensions:
             if one.kind in {LINEAR, RADIUS, ANGLE} and np.isfinite(one.built):
                 unit = np.degrees(1.0) if one.kind == ANGLE else 1e3

@@ -32,6 +32,7 @@ from scanfind.results.schema import (
     Vector,
 )
 from scanfind.simulate.parts import blocks
+from scanfind.tolerances import allowed_off, judge_findings
 
 STATIONS: list[Vector | None] = [(0.0, 0.0, 1.5), (4.0, 0.0, 1.5), (0.0, 4.0, 1.5)]
 
@@ -128,8 +129,9 @@ def folder_by_hand(out: Path, *, names: Sequence[str] = ("B1", "B2", "B3"), poin
         moved = replace(missing, status=INSTALLED, detection=k, shift_m=(0.0, 0.0, -off), turn_rad=0.0, off_m=off)
         findings.elements.append(replace(moved, on=0.9, beside=0.0, through=0.0, hidden=0.1) if k <= 2 else missing)
     findings.scans = [SceneScan("hall.e57", 100_000, 0, tuple(STATIONS))]
-    findings.tolerance_m, findings.allowed_m = 0.008, 0.03
+    findings.tolerance_m = 0.008
     with ModelLibrary.in_memory() as models:
         models.put(model)
+        judge_findings(findings, allowed_off(0.03), models)
         write_results(findings, out, models=models, parameters={})
     return out

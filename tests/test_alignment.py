@@ -302,7 +302,7 @@ def test_an_alignment_survives_the_result_folder_and_leads_back_into_the_design(
     with scanfind.ModelLibrary.in_memory() as library:
         library.add(replace(BRACKET, placements=PLACES))
         scanfind.write_results(inspected, tmp_path / "r", models=library, parameters=scanfind.PRESETS["default"])
-    results, _ = in_bim(tmp_path / "r")
+    results = in_bim(tmp_path / "r")
     before = {each.name: each.design_from_model for each in PLACES}
     for element in results.elements:
         np.testing.assert_allclose(element.design_from_model, before[element.name].matrix(), atol=1e-9)

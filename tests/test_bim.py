@@ -20,7 +20,7 @@ from scanfind.bim.bcf import plain, write_bcf
 from scanfind.bim.views import Shown, Views
 from scanfind.cli import main
 from scanfind.design.elements import INSTALLED, NOT_FOUND, Element
-from scanfind.detection import Findings
+from scanfind.detection import Detection, Findings
 from scanfind.errors import OutputError, UnreadableFileError, UsageError
 from scanfind.library import ModelLibrary
 from scanfind.library.model import ModelParameters
@@ -30,6 +30,7 @@ from scanfind.models import read_models
 from scanfind.pose import Pose
 from scanfind.results import write_results
 from scanfind.simulate.parts import box
+from scanfind.tolerances import allowed_off, judge_findings
 from test_models_ifc import write
 
 SCHEMAS = Path(__file__).parent / "data" / "bcf-2.1"
@@ -53,10 +54,21 @@ def result(out: Path, design: Path, *, moved: Iterable[str], missing: Iterable[s
                 place = placement.design_from_model
                 motion = place @ OFF @ place.inverse() if placement.name in moved else Pose.identity()
                 elements.append(an_element(placement, mesh.name, None if placement.name in missing else motion))
-        findings = Findings()
-        findings.elements, findings.allowed_m = elements, 0.01
+        findings = Findings([instance(k, each) for k, each in enumerate(elements) if each.built_from_design])
+        findings.elements = [
+            replace(each, detection=k) if each.built_from_design else each for k, each in enumerate(elements)
+        ]
+        judge_findings(findings, allowed_off(0.01), library)
         write_results(findings, out, models=library, parameters=scanfind.PRESETS["default"])
     return out
+
+
+def instance(number: int, element: Element) -> Detection:
+    """What is taken for an element that stands, measured to a tenth of a millimetre."""
+    assert element.built_from_design is not None
+    pose, pivot = element.built_from_design @ element.placement.design_from_model, (0.0, 0.0, 0.0)
+    found = Detection(number, element.model, pose, 0.95, 0.5, 0.9, 0.0, 0.5, 0.001)
+    return replace(found, covariance=np.diag([1e-8] * 6), pivot=pivot)
 
 
 def an_element(placement: Placement, model: str, motion: Pose | None) -> Element:
@@ -116,7 +128,7 @@ def test_a_topic_for_every_finding_as_the_schemas_want_it(inspected: Path, bars:
     assert len(topics) == 2
     [off] = [topic for title, topic in topics.items() if title.startswith("off: installed, ")]
     [lost] = [topic for title, topic in topics.items() if title.endswith(": not found")]
-    assert "Allowed: 10 mm." in off["markup.bcf"].findtext("Topic/Description")
+    assert "allowed 10 mm" in off["markup.bcf"].findtext("Topic/Description")
     ids = {p.name: p.global_id for mesh in read_models(bars) if isinstance(mesh, Mesh) for p in mesh.placements}
     for topic, name in ((off, "off"), (lost, ODD)):
         view = topic["viewpoint.bcfv"]
@@ -281,7 +293,7 @@ def test_without_move_only_properties_are_new(inspected: Path, bars: Path, tmp_p
     (tmp_path / "wide.toml").write_text("[[rule]]\noff_mm = 100.0\n")
     write_as_built(inspected, tmp_path / "told.ifc", tmp_path / "again.ifc", tolerance=tmp_path / "wide.toml")
     second = properties(tmp_path / "again.ifc")
-    assert (first["off"]["Verdict"], second["off"]["Verdict"]) == ("out_of_tolerance", "not_judged")  # no detection
+    assert (first["off"]["Verdict"], second["off"]["Verdict"]) == ("out_of_tolerance", "in_tolerance")
     assert (tmp_path / "again.ifc").read_text().count("IFCPROPERTYSET(") == 3
 
 

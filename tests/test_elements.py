@@ -22,7 +22,6 @@ from scanfind.design.elements import (
     OCCLUDED,
     OUT_OF_TOLERANCE,
     UNCERTAIN,
-    Element,
     assigned,
     off_by,
     status_at,
@@ -40,6 +39,7 @@ from scanfind.results import MODELS, read_results
 from scanfind.simulate.parts import blocks, box, cylinder
 from scanfind.simulate.scanner import Scanner, scan
 from scanfind.simulate.scene import Scene, SceneObject
+from scanfind.tolerances import allowed_off, judge_findings, profile_in
 
 SMALL = ModelParameters(SurfaceParameters(samples=200))
 BRACKET = blocks("bracket", [((0, 0, 0), (1, 0.3, 0.1)), ((0, 0, 0), (0.1, 0.3, 0.7))])
@@ -79,15 +79,6 @@ def test_what_beams_say_of_a_place_makes_its_status(spoken: Spoken | None, statu
     told, why = status_at(spoken, 1.0)
     assert told == status
     assert why
-
-
-def test_a_verdict_needs_a_place_and_a_tolerance() -> None:
-    there = Placement("", "", "", Pose.identity())
-    element = Element(there, "m", INSTALLED, 1, (0.0, 0.0, 0.004), 0.0, 0.004, None, None, None, None, "")
-    assert element.verdict(None) is None
-    assert element.verdict(0.005) == IN_TOLERANCE
-    assert element.verdict(0.003) == OUT_OF_TOLERANCE
-    assert replace(element, off_m=None).verdict(0.005) is None
 
 
 def test_each_detection_is_taken_for_the_place_nearest_to_it_and_once() -> None:
@@ -173,6 +164,17 @@ def test_every_element_has_the_status_it_should(inspected: scanfind.Findings) ->
     assert len(inspected) == 2
 
 
+def test_what_each_station_says_adds_up_to_what_all_say(inspected: scanfind.Findings) -> None:
+    for element in inspected.elements:
+        assert {each.station for each in element.stations} <= {1, 2}
+        said = np.sum([each[1:] for each in element.stations], axis=0)
+        # A station that speaks of less than a hundredth is left out.
+        shares = (element.on, element.beside, element.through, element.hidden)
+        np.testing.assert_allclose(said, np.array(shares, np.float64), atol=0.01)
+    for found in inspected:
+        assert sum(sum(each[1:]) for each in found.stations) == pytest.approx(1.0, abs=0.01)
+
+
 def test_displacements_are_measured(inspected: scanfind.Findings) -> None:
     here, off = inspected.elements[:2]
     assert here.off_m is not None
@@ -186,11 +188,13 @@ def test_elements_survive_the_result_folder(inspected: scanfind.Findings) -> Non
     from scanfind.results.document import document, findings_of
     from scanfind.results.schema import Results
 
-    inspected.allowed_m = 0.005
+    with ModelLibrary.in_memory() as models:
+        models.add(DESIGN)
+        judge_findings(inspected, allowed_off(0.005), models)
     told = document(inspected, models=[], parameters=scanfind.PRESETS["default"], seed=0)
     assert [each.verdict for each in told.elements] == [IN_TOLERANCE, OUT_OF_TOLERANCE, None, None]
     again = findings_of(Results.model_validate_json(told.to_json()))
-    assert again.allowed_m == 0.005
+    assert profile_in(told) == allowed_off(0.005)
     for one, other in zip(again.elements, inspected.elements, strict=True):
         poses = {"placement": None, "built_from_design": None}  # those are not equal even to themselves
         assert replace(one, **poses) == replace(other, **poses)  # type: ignore[arg-type]
@@ -223,7 +227,7 @@ def test_points_are_cut_again_without_losing_the_elements(tmp_path: Path) -> Non
     scans = [folder / str(found.isolated) for found in before.detections]
     after = isolate_again(folder, scans, tolerance=0.003)
     assert after.elements == before.elements
-    assert after.allowed_m == before.allowed_m
+    assert after.profile == before.profile is not None
     assert all(found.points < 500 for found in after.detections)
     with ModelLibrary.open(folder / MODELS) as kept:
         assert kept.names() == ["beam"]

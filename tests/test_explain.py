@@ -17,7 +17,7 @@ from scanfind.results.explain import (
     shift_in_words,
     stations_in_words,
 )
-from scanfind.results.schema import ElementEntry, ScanEntry
+from scanfind.results.schema import ElementEntry, ScanEntry, StationEntry
 
 
 def told(each: ElementEntry) -> str:
@@ -42,6 +42,20 @@ def told(each: ElementEntry) -> str:
 )
 def test_each_status_says_what_decided_it(each: ElementEntry, words: str) -> None:
     assert words in told(each)
+
+
+def test_the_station_that_decides_is_named_with_its_scan() -> None:
+    says = [StationEntry(station=k, on=0.0, beside=0.0, through=0.1 * k, hidden=0.1) for k in (1, 2)]
+    says.append(StationEntry(station=3, on=0.0, beside=0.0, through=0.0, hidden=0.4))
+    says[1] = says[1].model_copy(update={"beside": 0.1})
+    each = absent(NOT_FOUND, 0.0, 0.0, 0.3, 0.6, stations=says)
+    stood = [ScanEntry(path=path, points=1, dropped=0, stations_m=[(0.0, 0.0, 0.0)]) for path in ("a.e57", "d/b.e57")]
+    stood.append(ScanEntry(path="c.e57", points=1, dropped=0, stations_m=[(1.0, 0.0, 0.0)]))
+    [gone, *_] = element_sentences(results(each, scans=stood), each)
+    ending = "of the surface that the 3 stations should see is empty space; of what station 2 (b.e57) should see, 67 %."
+    assert gone.endswith(ending)
+    hidden = each.model_copy(update={"status": OCCLUDED})
+    assert "of what station 3 (c.e57) should see, 100 %" in element_sentences(results(hidden, scans=stood), hidden)[0]
 
 
 @pytest.mark.parametrize("status", [INSTALLED, UNCERTAIN, OCCLUDED, NOT_FOUND, NOT_ENOUGH_DATA, NO_DATA])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from math import radians
 from pathlib import Path
 
@@ -10,10 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from by_hand import absent, at, detection, element, motion, part, results
+from by_hand import absent, at, detection, element, folder_by_hand, motion, part, results
+from scanfind.cli.inspect import failed
 from scanfind.design.elements import INSTALLED, NO_DATA, NOT_ENOUGH_DATA, NOT_FOUND, OCCLUDED, UNCERTAIN
 from scanfind.errors import UsageError
+from scanfind.library import ModelLibrary
 from scanfind.pose import random_rotation
+from scanfind.results import MODELS, read_results
 from scanfind.results.schema import AxisEntry, DetectionEntry, ElementEntry, ModelEntry, SymmetryEntry
 from scanfind.simulate.parts import cylinder
 from scanfind.tolerances import (
@@ -28,9 +32,13 @@ from scanfind.tolerances import (
     allowed_off,
     judge_detection,
     judge_element,
+    judge_results,
     load_profile,
+    profile_allowing,
+    profile_in,
 )
 from scanfind.tolerances.discs import Disc, disc_of
+from scanfind.tolerances.profile import profile_of
 
 SHIFT = Profile("", (Rule({}, {"shift_mm": Limit(0.01)}),))
 OFF = allowed_off(0.01)
@@ -214,3 +222,47 @@ def test_a_verdict_of_the_run_is_that_of_its_profile() -> None:
     each = element(status=INSTALLED, shift_m=(0.0, 0.0, 0.004), off_m=0.004)
     assert judged(allowed_off(0.005), each).verdict == IN
     assert judged(allowed_off(0.003), each).verdict == OUT
+
+
+# ── of an inspection ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_profile_survives_as_the_tables_that_a_file_of_it_has(name: str) -> None:
+    profile = load_profile(name)
+    again = profile_of(json.loads(json.dumps(profile.tables())), "again")
+    assert again.title == profile.title
+    for one, other in zip(again.rules, profile.rules, strict=True):
+        assert one.patterns == other.patterns
+        assert one.limits.keys() == other.limits.keys()
+        for key, limit in one.limits.items():
+            assert limit.value == pytest.approx(other.limits[key].value, rel=1e-12)
+            assert limit.source == other.limits[key].source
+
+
+def test_what_is_allowed_is_a_length_a_preset_or_a_file(tmp_path: Path) -> None:
+    assert profile_allowing(0.01) == profile_allowing("0.01") == allowed_off(0.01)
+    assert profile_allowing("pipe-spools") == load_profile("pipe-spools")
+    assert (
+        profile_allowing(written(tmp_path, "[[rule]]\nshift_mm = 5")).rules
+        == load_profile(tmp_path / "profile.toml").rules
+    )
+    assert profile_allowing(SHIFT) is SHIFT
+    for wrong in (0.0, -1.0, "nan", "inf", "no-such-profile"):
+        with pytest.raises(UsageError):
+            profile_allowing(wrong)
+
+
+def test_an_inspection_is_judged_as_a_report_of_it_is(tmp_path: Path) -> None:
+    inspected = read_results(folder_by_hand(tmp_path / "r"))
+    assert [each.verdict for each in inspected.elements] == [IN, IN, None]
+    strict = Profile("strict", (Rule({}, {"shift_mm": Limit(0.005)}),))
+    with ModelLibrary.open(tmp_path / "r" / MODELS) as models:
+        told = judge_results(inspected, strict, models)
+    assert [each.verdict for each in told.elements] == [IN, OUT, None]
+    assert told.elements[1].verdict_why == judge_element(strict, inspected, inspected.elements[1]).why
+    assert profile_in(told) == strict
+    assert failed(told, "out-of-tolerance")
+    gone = {"elements": told.elements[:2], "profile": None, "allowed_m": 0.03}
+    assert profile_in(told.model_copy(update=gone)) == allowed_off(0.03)  # as versions before this one said it
+    assert not failed(told.model_copy(update=gone), "not-found")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import naive
 from scanfind.cloud import CloudModel, PointChunk
-from scanfind.evidence.free_space import Limits, caster_of, spoken_of
+from scanfind.evidence.free_space import Limits, caster_of, spoken_by_each, spoken_of
 from scanfind.evidence.verify import distinct, gather_support, spread
 from scanfind.fit.refine import Refined
 from scanfind.grid.depth import LEAST_SPOKEN, Beams, DepthMap, joined_until_spoken
@@ -205,6 +205,16 @@ def test_moving_everything_changes_nothing_a_beam_says() -> None:
     # Other pixels hold other beams.
     np.testing.assert_allclose(told, here, rtol=0.15, atol=0.006)
     assert min(here.hidden, here.through) > 0.01
+
+
+def test_what_all_scanners_say_is_what_each_says_summed() -> None:
+    placed, limits, points = Pose(np.eye(3), np.array([2.1, 0.15, 0.1])), Limits(0.01, 0.05, 0.25), points_seen()
+    scanners = [beams_about(np.zeros(3), points[::2]), beams_about(np.array([0.1, 0.4, 0.0]), points[1::2])]
+    each = spoken_by_each(box(), caster_of(box()), placed, scanners, limits)
+    np.testing.assert_allclose(spoken_of(box(), caster_of(box()), placed, scanners, limits), each.sum(axis=0))
+    for row, scanner in zip(each, scanners, strict=True):
+        np.testing.assert_allclose(row, spoken_of(box(), caster_of(box()), placed, [scanner], limits))
+        assert row.sum() > 0.0
 
 
 def test_of_more_beams_than_needed_a_share_says_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

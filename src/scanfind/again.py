@@ -18,6 +18,7 @@ from scanfind.results import MODELS, fill_folder, open_remainder, read_results, 
 from scanfind.results.document import findings_of
 from scanfind.scans.sources import Sources
 from scanfind.threads import available_cores
+from scanfind.tolerances import judge_findings, profile_in
 
 if TYPE_CHECKING:
     from scanfind.progress import Progress
@@ -59,7 +60,8 @@ def isolate_again(
             say_if_compiling(tell)
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
             # Of the whole model as designed, also where the search fitted its parts one by one.
-            surfaces, plans = surfaces_of(found, models.models(), within), plans_of(found, models.models())
+            surfaces = surfaces_of(found, models.models(), within)
+            plans = plans_of(found, models.models()) if before.measured() else {}
             reach = max([within, *(plan.reach for plan in plans.values())])
             cut, around = with_points(found, surfaces, {}, chunks, within, rest, available_cores(), reach)
         # Where the scanner stood may have been told to the search by hand.
@@ -77,10 +79,11 @@ def isolate_again(
             ]
         findings = Findings(told)
         findings.refused, findings.notes = found.refused, found.notes
-        findings.elements, findings.allowed_m = found.elements, found.allowed_m
-        findings.alignment = found.alignment
+        findings.elements, findings.alignment = found.elements, found.alignment
         findings.shift, findings.crs, findings.tolerance_m = found.shift, found.crs, within
         findings.scans = seen
+        if profile := profile_in(before):
+            judge_findings(findings, profile, models)
         findings.timings_s = clock.timings()
         return fill_folder(
             folder, findings, models=models, sought=before.models, parameters=before.parameters, seed=before.seed,

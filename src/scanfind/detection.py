@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from scanfind.pose import Pose
 if TYPE_CHECKING:
     from scanfind.design.alignment import Alignment
     from scanfind.design.elements import Element
+    from scanfind.tolerances.profile import Profile
 
 Floats = NDArray[np.float64]
 
@@ -126,6 +127,19 @@ class IsolatedPoints:
         return len(self.xyz)
 
 
+class StationSays(NamedTuple):
+    """What the beams of one station say of a placed model, as shares of the surface that those of all went to.
+
+    station : its number, from 1, among those of all scans in order; the others : see free_space.Spoken
+    """
+
+    station: int
+    on: float
+    beside: float
+    through: float
+    hidden: float
+
+
 @dataclass(frozen=True, eq=False)
 class Detection:
     """One instance of one model, as found.
@@ -144,6 +158,10 @@ class Detection:
     pivot : (3,) the point the covariance is about, in the middle of the placed model, scene frame, metres
     parts : of an assembly, each measured by itself; empty where that was not asked for or it has but one
     dimensions : what a drawing of it would give, as built; empty for a piece of scan and for free forms
+    stations : what each station says of it; empty where there are not several
+    slide : (3,) unit direction along which beams that went past its ends, not its faces, say where it stands; None
+        where none was asked or none could
+    instead_of : the element in whose place it stands, where two were swapped; else empty
     """
 
     id: int
@@ -162,6 +180,9 @@ class Detection:
     pivot: tuple[float, float, float] | None = None
     parts: tuple[PartFit, ...] = ()
     dimensions: tuple[Dimension, ...] = ()
+    stations: tuple[StationSays, ...] = ()
+    slide: tuple[float, float, float] | None = None
+    instead_of: str = ""
 
     @property
     def sigma_m(self) -> float:
@@ -206,7 +227,7 @@ class Findings(list[Detection]):
 
     tolerance_m : within which raw points were isolated, metres; None where they were not
     elements : of the design, what became of each; empty where that was not asked for
-    allowed_m : by how much an element may be off, metres; None: nobody says
+    profile : how far elements may be off; None: nobody says
     missing : scans that could not be read and were left out, and why
     alignment : where the design lies in the scans, where that was found; None: they are in one frame
     expected : how many instances of a model, by its name, were expected; of others nobody said
@@ -220,7 +241,7 @@ class Findings(list[Detection]):
     notes: list[str]
     tolerance_m: float | None
     elements: list[Element]
-    allowed_m: float | None
+    profile: Profile | None
     missing: list[str]
     alignment: Alignment | None
     expected: dict[str, int]
@@ -229,9 +250,14 @@ class Findings(list[Detection]):
         super().__init__(detections or [])
         self.refused, self.scans, self.notes, self.elements, self.missing = [], [], [], [], []
         self.shift, self.crs, self.timings_s, self.tolerance_m = (0.0, 0.0, 0.0), None, {}, None
-        self.allowed_m, self.alignment, self.expected = None, None, {}
+        self.profile, self.alignment, self.expected = None, None, {}
 
     def as_expected(self) -> list[str]:
         """Of each model of which so many were expected, how many were found, in words."""
         found = Counter(one.model for one in self)
         return [f"{name}: {found[name]} of {count} expected found" for name, count in self.expected.items()]
+
+    def stations(self) -> Floats:
+        """Where the scanners of all scans stood, in order, (S, 3); NaN where nobody knows."""
+        nowhere = (np.nan,) * 3
+        return np.array([where or nowhere for scan in self.scans for where in scan.stations]).reshape(-1, 3)

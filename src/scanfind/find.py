@@ -29,13 +29,14 @@ from scanfind.mesh import Mesh
 from scanfind.parameters import PRESETS, IsolationParameters, Parameters
 from scanfind.pose import Pose
 from scanfind.priors.allowed import box_around
-from scanfind.recognition.recognise import Recognition
+from scanfind.recognition.recognise import Recognition, design_of
 from scanfind.recognition.sizes import Sizes
 from scanfind.scans.sources import Scan, Sources, require_points
 from scanfind.threads import available_cores
 
 if TYPE_CHECKING:
     from scanfind.detection import Detection, IsolatedPoints
+    from scanfind.evidence.free_space import Design
     from scanfind.kernels.distance import NearSurface
     from scanfind.progress import Progress
     from scanfind.recognition.recognise import Standing
@@ -101,8 +102,13 @@ def find(
         grid.release()
         require_points_in(box, grid.points, grid.offset)
 
+    design = design_of(library) if at_design else None
     for size in found.groups():  # large models first, each size at its own resolution
-        found.add(recognise(size, grid, found.standing(), parameters, seed, jobs, clock, tell, at_design=at_design))
+        found.add(
+            recognise(
+                size, grid, found.standing(), parameters, seed, jobs, clock, tell, at_design=at_design, design=design
+            )
+        )
     del grid
     tell("search", 1.0, 1.0)
 
@@ -117,7 +123,8 @@ def find(
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
             tolerance = isolation_tolerance(parameters.isolate, found.noise(), found.cell())
             findings.tolerance_m = tolerance
-            surfaces, plans = surfaces_of(findings, library, tolerance), plans_of(findings, library)
+            surfaces = surfaces_of(findings, library, tolerance)
+            plans = plans_of(findings, library) if parameters.isolate.dimensions else {}
             built, reach = found.built(), max([tolerance, *(plan.reach for plan in plans.values())])
             findings[:], around = with_points(findings, surfaces, built, chunks, tolerance, remainder, jobs, reach)
         with clock("refine"):  # 3.4 once more, on the raw points: the exact surface, and how uncertain the pose is
@@ -126,17 +133,22 @@ def find(
                 one if one.parts else polished(one, surfaces[one.model], parameters.refine, jobs) for one in findings
             ]
         with clock("measure"):  # what a drawing would dimension, as built
-            stations = [place for source in sources.all for place in source.told().stations]
+            places = [place for source in sources.all for place in source.told().stations]
             findings[:] = [
-                dimensioned(one, plan, surfaces[one.model], around[one.id], stations, reach, built.get(one.id))
+                dimensioned(one, plan, surfaces[one.model], around[one.id], places, reach, built.get(one.id))
                 if (plan := plans.get(one.model))
                 else one
                 for one in findings
             ]
-    if at_design:
-        with clock("verify"):
-            findings.elements = found.elements(findings)
     findings.scans = [source.told() for source in sources.all]
+    with clock("verify"):
+        stations = findings.stations()
+        if at_design:
+            findings[:] = found.with_ends(findings)
+        if len(stations) > 1:
+            findings[:] = [found.with_stations(one, stations) for one in findings]
+        if at_design:
+            findings.elements = found.elements(findings, stations)
     findings.expected = parameters.priors.expected([model.name for model in library])
     findings.crs, findings.notes = sources.crs(), [*findings.as_expected(), *found.notes()]
     findings.shift = found.shift()
@@ -146,18 +158,18 @@ def find(
 
 def recognise(
     size: Size, grid: MomentGrid, standing: Sequence[Standing], parameters: Parameters, seed: int, jobs: int,
-    clock: Clock, tell: Progress, *, at_design: bool,
+    clock: Clock, tell: Progress, *, at_design: bool, design: Design | None = None,
 ) -> Recognition:  # fmt: skip
     """The search for models of one size: what is believed of them, and why (paper 3.3 and 3.4).
 
-    standing : instances of larger models
+    standing : instances of larger models; at_design : try them where the design has them first; design : all of it
     """
     with clock("grid"):
         smallest = min(model.diameter for model in size.models)
         scene = build_scene(grid, smallest, parameters.grid, parameters.search.test_cells_across, jobs)
     with clock("library"):
         table = joint_table(size.models, each_once=parameters.search.each_once)
-    found = Recognition(scene, size.models, table, parameters, seed, jobs, standing)
+    found = Recognition(scene, size.models, table, parameters, seed, jobs, standing, design)
     for hypotheses in found.at_design() if at_design else ():
         with clock("refine"):
             poses = found.refine_in_place(hypotheses)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from os import PathLike
 from typing import TYPE_CHECKING, Literal
 
 from scanfind.design.alignment import CELL_M, fitted, lies_at
@@ -16,6 +17,7 @@ from scanfind.library import ModelLibrary
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.priors.allowed import middle_of
 from scanfind.scans.sources import Sources
+from scanfind.tolerances import judge_findings, profile_allowing
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from scanfind.priors import Priors
     from scanfind.progress import Progress
     from scanfind.scans.sources import Scan
+    from scanfind.tolerances import Profile
 
 
 def inspect(
@@ -44,6 +47,7 @@ def inspect(
     progress: Progress | None = None,
     align: Literal["auto", "always", "never"] = "auto",
     upright: bool = False,
+    allowed: float | str | PathLike[str] | Profile | None = None,
 ) -> Findings:
     """Say of every element of a design what became of it: see `Findings.elements`.
 
@@ -53,12 +57,16 @@ def inspect(
         align : find from the elements where the design lies in the scans: "always"; "never", they are in one frame;
             "auto": where nothing at all is in its place
         upright : up is the same in design and scans
+        allowed : by how much elements may be off, metres, or a tolerance profile, its file or a preset's name: gives
+            installed elements a verdict
 
     `Findings.alignment` says where the design lies if that had to be found; elements are then where it puts them.
 
-    Raises as `find` does; with "always" AlignmentError, where the design fits nowhere, or in two ways.
+    Raises as `find` does, and UsageError for what is no profile; with "always" AlignmentError, where the design fits
+    nowhere, or in two ways.
     """
     parameters = parameters or PRESETS["default"]
+    profile = None if allowed is None else profile_allowing(allowed)
     models, priors = models_of(design, parameters, units, select), parameters.priors
     if priors.box() is not None or priors.near_design_m is not None:
         if align == "always":
@@ -66,31 +74,39 @@ def inspect(
             raise UsageError(msg)
         models, align = in_region(models, priors), "never"
 
-    def found(placed: Sequence[Model], *, at_design: bool, isolate: bool) -> Findings:
-        with ModelLibrary.in_memory() as library:
-            for model in placed:
-                library.put(model)
+    def found(placed: Sequence[Model], *, at_design: bool = True, isolate: bool = True) -> Findings:
+        with library_of(placed) as library:
             return find(
                 scans, library, parameters=parameters, seed=seed, jobs=jobs, origin=origin, progress=progress,
                 at_design=at_design, isolate=isolate,
             )  # fmt: skip
 
-    before = found(models, at_design=align != "always", isolate=align != "always")
-    in_place = any(element.status == INSTALLED for element in before.elements)
-    if align == "never" or (align == "auto" and in_place):
-        return before
-    sources = Sources(scans, origin)
-    try:
-        start = lies_at(models, before, Thinned((chunk.xyz for chunk in sources.chunks()), CELL_M), upright=upright)
-        placed = [moved(model, start) for model in models]
-        findings = found(placed, at_design=True, isolate=True)
-        alignment = fitted(models, findings, start)
-    except AlignmentError as error:
-        if align == "always":
-            raise
-        before.notes.append(f"nothing is where the design puts it, and {error}")
-        return before
-    findings.alignment = alignment
+    findings = found(models, at_design=align != "always", isolate=align != "always")
+    in_place = any(element.status == INSTALLED for element in findings.elements)
+    if align == "always" or (align == "auto" and not in_place):
+        try:
+            findings = realigned(models, findings, Sources(scans, origin), found, upright=upright)
+        except AlignmentError as error:
+            if align == "always":
+                raise
+            findings.notes.append(f"nothing is where the design puts it, and {error}")
+    if profile is not None:
+        with library_of(models) as library:
+            judge_findings(findings, profile, library)
+    return findings
+
+
+def realigned(
+    models: Sequence[Model], before: Findings, sources: Sources, found: Callable[[Sequence[Model]], Findings], *,
+    upright: bool,
+) -> Findings:  # fmt: skip
+    """Findings of a design after it was put where instances found `before`, anywhere, say it lies.
+
+    found : searches for models in their places; raises as `lies_at` does
+    """
+    start = lies_at(models, before, Thinned((chunk.xyz for chunk in sources.chunks()), CELL_M), upright=upright)
+    findings = found([moved(model, start) for model in models])
+    findings.alignment = alignment = fitted(models, findings, start)
     by_name = {model.name: model for model in models}
     correction = alignment.scene_from_design @ start.inverse()
     findings.elements = [retold(each, by_name[each.model], findings, correction) for each in findings.elements]
@@ -118,6 +134,14 @@ def placed_at(model: Model, places: Sequence[Placement]) -> Model:
     return replace(model, placements=tuple(places), mesh=mesh)
 
 
+def library_of(models: Sequence[Model]) -> ModelLibrary:
+    """Models in a library of their own, in memory; to be closed."""
+    library = ModelLibrary.in_memory()
+    for model in models:
+        library.put(model)
+    return library
+
+
 def moved(model: Model, scene_from_design: Pose) -> Model:
     """A model with its places where a motion puts them."""
     places = [
@@ -134,4 +158,4 @@ def retold(element: Element, model: Model, findings: Findings, correction: Pose)
         return replace(element, placement=place)
     shares = element.on, element.beside, element.through, element.hidden
     spoken = None if None in shares else Spoken(*(share or 0.0 for share in shares))
-    return installed(model, place, found, spoken)
+    return replace(installed(model, place, found, spoken), stations=element.stations)

@@ -21,10 +21,12 @@ class IsolationParameters:
 
     tolerance_m : those within this distance of the placed model's surface; None: `noises` times the scan's own noise
         around the detection, at least a tenth and at most half of the grid's cell
+    dimensions : measure what a drawing would dimension; a second a model, and a tenth of one a detection
     """
 
     tolerance_m: float | None = None
     noises: float = 4.0
+    dimensions: bool = False
 
     def __post_init__(self) -> None:
         require(

@@ -17,6 +17,7 @@ from scanfind.models.child import need_extra, one_line
 from scanfind.models.ifc_select import members
 from scanfind.pose import Pose
 from scanfind.results import result_file
+from scanfind.tolerances import profile_in
 
 if TYPE_CHECKING:
     from scanfind.results.schema import DetectionEntry, ElementEntry, Results
@@ -52,7 +53,7 @@ def write_as_built(
     MissingExtraError without ifcopenshell, OutputError where `out` is the design itself or cannot be written.
     """
     need_extra("ifcopenshell", "ifc", "IFC")
-    results, _ = inspected(result_dir, tolerance)
+    results = inspected(result_dir, tolerance)
     if not Path(design).is_file():
         msg = f"{design}: {'not a file' if Path(design).exists() else 'no such file'}"
         raise UnreadableFileError(msg)
@@ -159,6 +160,8 @@ class Properties:
         self._file, self._results = file, results
         self._length = calculate_unit_scale(file)
         self._angle = calculate_unit_scale(file, "PLANEANGLEUNIT")
+        profile = profile_in(results)
+        self._tolerances = None if profile is None else profile.title
         self._scans, self._dates = scans_in_words(results), file.schema != "IFC2X3"
 
     def write(self, product: Any, element: ElementEntry, found: DetectionEntry | None, *, moved: bool) -> None:
@@ -180,12 +183,13 @@ class Properties:
         """Name, measure and value of each property; None where it is not known."""
         yield "Status", "IfcLabel", element.status
         yield "Verdict", "IfcLabel", element.verdict
+        yield "VerdictReason", "IfcText", element.verdict_why or None
         yield "Reason", "IfcText", element.why
         for axis, shift in zip("XYZ", element.shift_m or (None, None, None), strict=True):
             yield f"Shift{axis}", "IfcLengthMeasure", self._in(shift, self._length)
         yield "Turn", "IfcPlaneAngleMeasure", self._in(element.turn_rad, self._angle)
         yield "LargestDisplacement", "IfcLengthMeasure", self._in(element.off_m, self._length)
-        yield "Allowed", "IfcLengthMeasure", self._in(self._results.allowed_m, self._length)
+        yield "Tolerances", "IfcLabel", self._tolerances
         if found is not None:
             yield "SeenShare", "IfcReal", found.coverage
         if found is not None and (deviation := found.deviation) is not None:

@@ -26,7 +26,7 @@ from scanfind.pose import Pose
 from scanfind.results import MODELS, RESULTS_JSON, result_file
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from scanfind.results.schema import ElementEntry, Results
 
@@ -63,10 +63,10 @@ def write_bcf(
 
     Raises UnreadableFileError for no result, UsageError where it is not of a design, LibraryError, OutputError.
     """
-    results, judgements = inspected(result_dir, tolerance)
+    results = inspected(result_dir, tolerance)
     made = results.made or _written(Path(result_dir))
     with result_file(out, overwrite=overwrite) as path, ZipFile(path, "w", ZIP_DEFLATED, compresslevel=9) as archive:
-        topics = topics_of(results, judgements, Path(result_dir) / MODELS, made)
+        topics = topics_of(results, Path(result_dir) / MODELS, made)
         when = datetime.strptime(made, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC).timetuple()[:6]
 
         def put(name: str, data: bytes) -> None:
@@ -88,8 +88,8 @@ def write_bcf(
     return len(topics)
 
 
-def topics_of(results: Results, judgements: Mapping[int, str], models: Path, made: str) -> list[Topic]:
-    """The findings in the order of the elements; judgements : see `inspected`; models : the library of their shapes."""
+def topics_of(results: Results, models: Path, made: str) -> list[Topic]:
+    """The findings in the order of the elements; models : the library of their shapes."""
     views = Views(shown(results.elements, models))
     topics = []
     for number, element in enumerate(results.elements):
@@ -97,9 +97,8 @@ def topics_of(results: Results, judgements: Mapping[int, str], models: Path, mad
             camera = views.camera(number)
             # A design of meshes has no GlobalIds: the place in the list tells elements apart.
             guid = uuid5(SPACE, f"{made} {number} {element.global_id} {element.status}")
-            told = description(results, element, judgements.get(number, ""))
             picture = png(views.picture(number, camera, COLOURS[element.status]))
-            topics.append(Topic(guid, element, told, camera, picture))
+            topics.append(Topic(guid, element, description(results, element), camera, picture))
     return topics
 
 

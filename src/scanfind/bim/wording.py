@@ -8,31 +8,34 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scanfind.design.elements import INSTALLED, OUT_OF_TOLERANCE
+from scanfind.design.elements import FAR_M, INSTALLED, OUT_OF_TOLERANCE
 from scanfind.errors import UsageError
+from scanfind.library import ModelLibrary
 from scanfind.pose import Pose
 from scanfind.results import MODELS, read_results
 from scanfind.results.document import rows
 from scanfind.results.explain import element_sentences, headline
+from scanfind.tolerances import judge_results, load_profile
 
 if TYPE_CHECKING:
     from scanfind.results.schema import ElementEntry, Results
 
 
-def inspected(result_dir: str | Path, tolerance: str | Path | None = None) -> tuple[Results, dict[int, str]]:
-    """The result of an inspection, in the axes of the design; by place among the elements why a profile judges them so.
+def inspected(result_dir: str | Path, tolerance: str | Path | None = None) -> Results:
+    """The result of an inspection, in the axes of the design.
 
     tolerance : a profile, see `load_profile`; None: the verdicts are those of the inspection
 
     Raises UnreadableFileError for no result, UsageError where it is of no design or for no profile.
     """
-    results, why = read_results(result_dir), dict[int, str]()
+    results = read_results(result_dir)
     if not results.elements:
         msg = f"{result_dir}: a result without a design: name one of `scanfind inspect --out`"
         raise UsageError(msg)
     if tolerance is not None:
-        results, why = _judged(results, Path(result_dir), tolerance)
-    return in_design(results), why
+        with ModelLibrary.open(Path(result_dir) / MODELS) as models:
+            results = judge_results(results, load_profile(tolerance), models)
+    return in_design(results)
 
 
 def in_design(results: Results) -> Results:
@@ -62,8 +65,9 @@ def in_design(results: Results) -> Results:
 
 
 def is_finding(element: ElementEntry) -> bool:
-    """Does somebody have to look at it? Not where it is installed and nobody says it is out of tolerance."""
-    return element.status != INSTALLED or element.verdict == OUT_OF_TOLERANCE
+    """Does somebody have to look at it? Not where it is installed, in no other place, and not out of tolerance."""
+    elsewhere = element.off_m is not None and element.off_m > FAR_M
+    return element.status != INSTALLED or elsewhere or element.verdict == OUT_OF_TOLERANCE
 
 
 def title(element: ElementEntry) -> str:
@@ -71,20 +75,15 @@ def title(element: ElementEntry) -> str:
     return f"{element.name or element.model}: {headline(element)}"
 
 
-def description(results: Results, element: ElementEntry, judgement: str) -> str:
-    """Some lines: the evidence, how far off in which direction, what is allowed, of which scans.
-
-    judgement : of a tolerance profile
-    """
+def description(results: Results, element: ElementEntry) -> str:
+    """Some lines: the evidence, how far off in which direction, what is allowed, of which scans."""
     lines = [*element_sentences(results, element)]
     if element.shift_m is not None:
         x, y, z = (1e3 * value for value in element.shift_m)
         turn = degrees(element.turn_rad or 0.0)
         lines.append(f"Shift of its middle: x {x:+z.1f}, y {y:+z.1f}, z {z:+z.1f} mm; turned by {turn:.2f}°.")
-    if judgement:
-        lines.append(f"{judgement[:1].upper()}{judgement[1:]}.")
-    elif results.allowed_m is not None and element.verdict is not None:
-        lines.append(f"Allowed: {1e3 * results.allowed_m:g} mm.")
+    if why := element.verdict_why:
+        lines.append(f"{why[:1].upper()}{why[1:]}.")
     lines.append(f"Scans: {scans_in_words(results)}; inspected {results.made or 'at an unknown time'}.")
     return "\n".join(lines)
 
@@ -92,20 +91,3 @@ def description(results: Results, element: ElementEntry, judgement: str) -> str:
 def scans_in_words(results: Results) -> str:
     """The names of the scan files, without their folders."""
     return ", ".join(scan.path.replace("\\", "/").rpartition("/")[2] for scan in results.scans) or "unknown"
-
-
-def _judged(results: Results, folder: Path, tolerance: str | Path) -> tuple[Results, dict[int, str]]:
-    from scanfind.library import ModelLibrary
-    from scanfind.tolerances import judge_element, load_profile
-    from scanfind.tolerances.discs import discs_of
-
-    profile = load_profile(tolerance)
-    with ModelLibrary.open(folder / MODELS) as library:
-        discs = {key: disc for model in library.models() for key, disc in discs_of(model).items()}
-    judgements = [judge_element(profile, results, element, discs) for element in results.elements]
-    elements = [
-        element.model_copy(update={"verdict": judgement.verdict if element.status == INSTALLED else None})
-        for element, judgement in zip(results.elements, judgements, strict=True)
-    ]
-    why = {place: judgement.why for place, judgement in enumerate(judgements) if elements[place].verdict is not None}
-    return results.model_copy(update={"elements": elements, "allowed_m": None}), why

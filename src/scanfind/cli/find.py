@@ -55,6 +55,7 @@ def find(
     min_score: float | None = None,
     tolerance: Metres | None = None,
     parts: Flag = False,
+    dimensions: Flag = False,
     time_limit: Seconds | None = None,
     region: Box | None = None,
     up: Direction | None = None,
@@ -121,6 +122,8 @@ def find(
         Points this near to a found model are its own, metres.
     parts
         Fit the parts of each model one by one: find what was not built to the drawing, and tell which part is off.
+    dimensions
+        Measure what a drawing would dimension as well: flange faces, pipes, lengths, squareness.
     time_limit
         Search no longer than this, seconds.
     region
@@ -168,7 +171,7 @@ def find(
     flags = {
         "preset": preset, "seed": seed, "jobs": jobs, "units": units, "origin": origin, "format": format,
         "select": select, "search.max_instances": max_instances, "search.time_limit_s": time_limit,
-        "verify.min_score": min_score, "isolate.tolerance_m": tolerance, "assembly.parts": parts or None,
+        "verify.min_score": min_score, "isolate.tolerance_m": tolerance, "isolate.dimensions": dimensions or None, "assembly.parts": parts or None,
         "priors.region": region, "priors.up": up, "priors.model_up": model_up, "priors.tilt_deg": tilt,
         "priors.near_design_m": near_design, "priors.turned_deg": turned, "priors.expect": expected(expect),
     }  # fmt: skip

@@ -24,7 +24,7 @@ def inspect(
     select: Names | None = None,
     units: Units | None = None,
     origin: Position | None = None,
-    allowed: Metres | None = None,
+    allowed: Annotated[str, Parameter(allow_leading_hyphen=True, metavar="M|PROFILE")] | None = None,
     out: Path | None = None,
     format: Format | None = None,
     overwrite: Flag = False,
@@ -33,6 +33,7 @@ def inspect(
     seed: Count | None = None,
     jobs: Count | None = None,
     tolerance: Metres | None = None,
+    dimensions: Flag = False,
     time_limit: Seconds | None = None,
     region: Box | None = None,
     near_design: Metres | None = None,
@@ -48,7 +49,7 @@ def inspect(
     For example:
 
         scanfind inspect shop.e57 --design steel.ifc --allowed 0.01 --out inspected
-        scanfind inspect shop.e57 --design steel.ifc --upright
+        scanfind inspect shop.e57 --design steel.ifc --allowed structural-steel --upright
 
     Parameters
     ----------
@@ -63,7 +64,7 @@ def inspect(
     origin
         X,Y,Z where the scanner stood, metres, for scans that do not say.
     allowed
-        By how much an element may be off, metres; without it nothing is in or out of tolerance.
+        By how much an element may be off: metres, or a tolerance profile: pipe-spools, structural-steel or a TOML file.
     out
         A new folder for statuses, poses and points; nothing is written without it.
     format
@@ -80,6 +81,8 @@ def inspect(
         Threads; one a core unless given.
     tolerance
         Points this near to a found element are its own, metres.
+    dimensions
+        Measure what a drawing would dimension as well: flange faces, pipes, lengths, squareness.
     time_limit
         Look for elements that are not in their place no longer than this, seconds.
     region
@@ -94,11 +97,8 @@ def inspect(
         Exit with 3 if some element was not found, or is not found or out of tolerance.
 
     """
-    if allowed is not None and not allowed > 0.0:
-        msg = f"inspect: --allowed is a length above 0, in metres, got {allowed:g}"
-        raise UsageError(msg)
     if fail_on == "out-of-tolerance" and allowed is None:
-        msg = "inspect: --fail-on out-of-tolerance needs to know how much is allowed: give --allowed M"
+        msg = "inspect: --fail-on out-of-tolerance needs to know how much is allowed: give --allowed"
         raise UsageError(msg)
 
     from scanfind.cli.inputs import open_models
@@ -107,22 +107,23 @@ def inspect(
     from scanfind.parameters import PRESETS
     from scanfind.progress import progress_on
     from scanfind.results import result_folder
+    from scanfind.tolerances import profile_allowing
 
     flags = {
         "seed": seed, "jobs": jobs, "units": units, "origin": origin, "format": format, "select": select,
-        "search.time_limit_s": time_limit, "isolate.tolerance_m": tolerance,
+        "search.time_limit_s": time_limit, "isolate.tolerance_m": tolerance, "isolate.dimensions": dimensions or None,
         "priors.region": region, "priors.near_design_m": near_design,
     }  # fmt: skip
     run, parameters = load_settings(PRESETS, flags, config)
+    profile = None if allowed is None else profile_allowing(allowed)  # before the search: it may be misspelt
     with ExitStack() as stack:
         folder = None if out is None else stack.enter_context(result_folder(out, overwrite=overwrite))
         models = stack.enter_context(open_models(design, None, run, parameters))
         progress = stack.enter_context(progress_on())
         findings = inspect_scans(
             scans, models, parameters=parameters, seed=run.seed, jobs=run.jobs, origin=run.origin,
-            progress=progress, align=align, upright=upright,
+            progress=progress, align=align, upright=upright, allowed=profile,
         )  # fmt: skip
-        findings.allowed_m = allowed
         results = results_of(findings, folder, models, run, parameters, progress)
     report(results, out, json=json)
     return NOT_AS_WANTED if fail_on and failed(results, fail_on) else 0

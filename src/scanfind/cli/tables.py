@@ -13,6 +13,7 @@ from scanfind.design.elements import (
     NO_DATA,
     NOT_ENOUGH_DATA,
     NOT_FOUND,
+    NOT_JUDGED,
     OCCLUDED,
     OUT_OF_TOLERANCE,
     UNCERTAIN,
@@ -39,7 +40,7 @@ FOUND = (
 ELEMENTS = ("element", "class", "status", "verdict", "id", "off mm", "x mm", "y mm", "z mm", "turned °", "why")
 # What needs a look first.
 ORDER = [
-    *((status, None) for status in (NOT_FOUND, UNCERTAIN)), (INSTALLED, OUT_OF_TOLERANCE),
+    (NOT_FOUND, None), (UNCERTAIN, None), (INSTALLED, OUT_OF_TOLERANCE), (INSTALLED, NOT_JUDGED),
     *((status, None) for status in (OCCLUDED, NOT_ENOUGH_DATA, NO_DATA, INSTALLED)), (INSTALLED, IN_TOLERANCE),
 ]  # fmt: skip
 
@@ -86,9 +87,11 @@ def elements_in_words(results: Results) -> str:
     """How many elements have which status, in one line."""
     counts = Counter(each.status for each in results.elements)
     told = [f"{count} {status.replace('_', ' ')}" for status, count in counts.most_common()]
-    if results.allowed_m is not None:
-        off = sum(each.verdict == OUT_OF_TOLERANCE for each in results.elements)
-        told.append(f"{off} out of tolerance ({results.allowed_m * 1e3:g} mm)")
+    if results.profile is not None:
+        verdicts = Counter(each.verdict for each in results.elements)
+        told.append(f"{verdicts[OUT_OF_TOLERANCE]} out of tolerance ({results.profile['title']})")
+        if verdicts[NOT_JUDGED]:
+            told.append(f"{verdicts[NOT_JUDGED]} not judged")
     return f"{len(results.elements)} elements of the design: {', '.join(told)}"
 
 
@@ -186,7 +189,7 @@ def _element_row(each: ElementEntry) -> list[str]:
         _number(each.off_m, 1, 1e3),
         *(_number(value, 1, 1e3) for value in each.shift_m or (None, None, None)),
         _number(None if each.turn_rad is None else degrees(each.turn_rad), 2),
-        each.why,
+        f"{each.why}; {each.verdict_why}" if each.verdict in {OUT_OF_TOLERANCE, NOT_JUDGED} else each.why,
     ]
 
 

@@ -8,12 +8,14 @@ not there), `not_enough_data` (too little of it was looked at), `no_data` (no be
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.detection import StationSays
+from scanfind.evidence.free_space import Spoken
 from scanfind.fit.refine import held
 from scanfind.mesh import Placement
 from scanfind.pose import Pose
@@ -21,7 +23,6 @@ from scanfind.symmetry import pose_error
 
 if TYPE_CHECKING:
     from scanfind.detection import Detection
-    from scanfind.evidence.free_space import Spoken
     from scanfind.library.model import Model
 
 Floats = NDArray[np.float64]
@@ -38,7 +39,10 @@ MAY_BE, IS_NOT = 0.5, 0.7
 # Farther from its place than this and it may as well be another part of the same shape.
 FAR_M = 0.5
 SAID_M = 0.002  # what a motion that is held at the design's would add is told from here on
-IN_TOLERANCE, OUT_OF_TOLERANCE = "in_tolerance", "out_of_tolerance"
+IN_TOLERANCE, OUT_OF_TOLERANCE, NOT_JUDGED = "in_tolerance", "out_of_tolerance", "not_judged"
+# A motion fixed so much worse than others on average is asked of the ends; and so much of it must be a slide.
+OPEN, SLIDES = 0.1, 0.5
+LEAST_SAID = 0.01  # of the surface that beams went to: a station that speaks of less is not told
 PAIRED_BY = 50  # samples, which lie evenly over the model: they tell which of two places is nearer
 
 
@@ -57,6 +61,9 @@ class Element:
     why : the evidence in words
     built_from_design : what moves it from its place in the design to where it stands, in the design's axes about their
         origin; without the motions the scan hardly fixes. None unless installed
+    stations : what each station says of its place in the design; empty where there are not several
+    verdict, verdict_why : in_tolerance, out_of_tolerance or not_judged, and why (see `scanfind.tolerances`); None
+        unless it is installed and somebody said how far off it may be
     """
 
     placement: Placement
@@ -72,12 +79,9 @@ class Element:
     hidden: float | None
     why: str
     built_from_design: Pose | None = None
-
-    def verdict(self, allowed_m: float | None) -> str | None:
-        """Is it where it should be to within so many metres? None where it was not found or nobody says how far."""
-        if self.off_m is None or allowed_m is None or self.status != INSTALLED:
-            return None
-        return IN_TOLERANCE if self.off_m <= allowed_m else OUT_OF_TOLERANCE
+    verdict: str | None = None
+    verdict_why: str = ""
+    stations: tuple[StationSays, ...] = ()
 
 
 def placements_of(model: Model) -> tuple[Placement, ...]:
@@ -86,18 +90,21 @@ def placements_of(model: Model) -> tuple[Placement, ...]:
 
 
 def elements_of(
-    model: Model, detections: Sequence[Detection], spoken_at: Callable[[Pose], Spoken | None]
+    model: Model, detections: Sequence[Detection], spoken_at: Callable[[Pose], Floats], stations: Sequence[int] = ()
 ) -> list[Element]:
     """The elements of a design that are of one model, in the order of its placements.
 
     detections : in the scans' frame, which is the design's
-    spoken_at : what beams say of the model at a pose; None where no scanner position is known
+    spoken_at : what the beams of each of S scanners say of the model at a pose: rows as of Spoken, (S, 4), m²
+    stations : their numbers
     """
     placements, found = placements_of(model), []
     taken = assigned(model, placements, [one for one in detections if one.model == model.name])
     for place, placement in enumerate(placements):
-        spoken, one = spoken_at(placement.design_from_model), taken.get(place)
-        found.append(missed(model, placement, spoken) if one is None else installed(model, placement, one, spoken))
+        by_each, one = spoken_at(placement.design_from_model), taken.get(place)
+        spoken = Spoken(*by_each.sum(axis=0).tolist()) if len(by_each) else None
+        told = missed(model, placement, spoken) if one is None else installed(model, placement, one, spoken)
+        found.append(replace(told, stations=said_by(by_each, stations)))
     return found
 
 
@@ -132,11 +139,13 @@ def installed(model: Model, placement: Placement, found: Detection, spoken: Spok
     x, y, z = (stands.move(centre) - design.move(centre))[0].tolist()
     turn = pose_error(stands, design, model.symmetry).rotation_rad
     off = off_by(model, model.samples.points, stands, design)
-    if off > FAR_M:
+    if off > FAR_M and not found.instead_of:
         _, there = status_at(spoken, model.area)
         why = f"where it should be {there}; one of its shape stands {off:.2f} m off"
         return Element(placement, model.name, UNCERTAIN, found.id, (x, y, z), turn, off, *shares(spoken), why)
     why = f"found with score {found.score:.2f}: {found.coverage:.0%} of its surface lies on the scan"
+    if found.instead_of:
+        why = f"{why}; it stands in the place of {found.instead_of}"
     further = off_by(model, model.samples.points, found.scene_from_model, design) - off
     if further > SAID_M:
         why += f"; {1e3 * further:.0f} mm more, along a motion the scan hardly fixes, are left out"
@@ -147,14 +156,27 @@ def installed(model: Model, placement: Placement, found: Detection, spoken: Spok
 def drawn_back(model: Model, found: Detection, design: Pose) -> Pose:
     """Where an element stands, as designed along the motions that the scan hardly fixes."""
     alike = model.symmetry.nearest(found.scene_from_model, design.rotation)
-    if found.covariance is None or found.pivot is None:
+    if found.covariance is None or found.pivot is None or found.instead_of:
         return alike
     middle = found.scene_from_model.inverse().move(np.array(found.pivot)[None])
     radius = 0.5 * model.diameter
     information = information_of(found, radius)
+    if found.slide is not None:  # its ends say it, however little its faces do
+        along = np.concatenate([np.zeros(3), found.slide])
+        information = information + np.trace(information) / 6.0 * np.outer(along, along)
     # The pivot is in the middle of what was seen; a symmetry may have turned that elsewhere.
     there = alike.inverse().move(found.scene_from_model.move(middle))[0]
     return held(design, alike, information, there, radius)
+
+
+def open_slide(model: Model, found: Detection) -> Floats | None:
+    """The direction (3,) of a slide that the faces of an instance leave open, scan axes; None where there is none."""
+    values, motions = np.linalg.eigh(information_of(found, 0.5 * model.diameter))
+    for value, motion in zip(values, motions.T, strict=True):
+        share = np.linalg.norm(motion[3:])
+        if value < OPEN * values.mean() and share > SLIDES:
+            return np.asarray(motion[3:] / share)
+    return None
 
 
 def information_of(found: Detection, radius: float) -> Floats:
@@ -173,6 +195,15 @@ def missed(model: Model, placement: Placement, spoken: Spoken | None) -> Element
     """An element that was not found, and what its place in the design looks like."""
     status, why = status_at(spoken, model.area)
     return Element(placement, model.name, status, None, None, None, None, *shares(spoken), why)
+
+
+def said_by(by_each: Floats, stations: Sequence[int]) -> tuple[StationSays, ...]:
+    """What each of S stations says, (S, 4) m², as shares of what all went to; none of one station alone."""
+    if len(by_each) < 2:
+        return ()
+    parts = by_each / max(by_each.sum(), 1e-300)
+    told = zip(stations, parts.tolist(), strict=True)
+    return tuple(StationSays(number, *part) for number, part in told if sum(part) >= LEAST_SAID)
 
 
 def shares(spoken: Spoken | None) -> tuple[float | None, float | None, float | None, float | None]:

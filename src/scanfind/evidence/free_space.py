@@ -49,11 +49,31 @@ class Limits(NamedTuple):
     inlier : it met the surface if it ended within so many metres of it, across it
     margin : it passed through if it went on so many metres farther
     facing : least cosine to the surface's normal; a beam that grazes it may bring nothing back
+    edge : a beam so near to the outline says nothing if it went on, metres; 0: `inlier`
     """
 
     inlier: float
     margin: float
     facing: float
+    edge: float = 0.0
+
+
+class Design(NamedTuple):
+    """All elements where the design has them: what a beam met of them hides what it would have met behind.
+
+    caster : in the scans' own frame; models : name of the model of each mesh in it
+    """
+
+    caster: RayCaster
+    models: tuple[str, ...]
+
+    def met(self, model: str, beams: Towards, inlier: float) -> Floats:
+        """How far off beams ended on an element that is not of a model, (B,) metres; infinite where they did not."""
+        hits = self.caster.shoot(beams.origins, beams.directions)
+        other = np.array([name != model for name in self.models])[hits.owner]
+        first = np.isfinite(hits.distance) & other
+        off = np.abs(beams.ranges - np.where(first, hits.distance, 0.0)) * hits.cosine
+        return np.where(first & (off <= inlier), hits.distance, np.inf)
 
 
 def caster_of(model: Model) -> RayCaster:
@@ -73,9 +93,20 @@ def caster_of(model: Model) -> RayCaster:
 
 def spoken_of(model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams], limits: Limits) -> Spoken:
     """What the beams of all scanners say of a model placed by scene_from_model, relative to the grid's offset."""
+    return Spoken(*spoken_by_each(model, caster, placed, scanners, limits).sum(axis=0).tolist())
+
+
+def spoken_by_each(
+    model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams], limits: Limits,
+    design: Design | None = None, offset: Floats | None = None,
+) -> Floats:  # fmt: skip
+    """What the beams of each of S scanners say: rows as of `Spoken`, (S, 4), m².
+
+    design, offset : of a model that is in its place in it, what hides it there; the grid's offset, (3,)
+    """
     beams = towards(model, placed, scanners)
     if not len(beams.ranges):
-        return Spoken(0.0, 0.0, 0.0, 0.0)
+        return np.zeros((len(scanners), 4))
     back = placed.inverse()
     origins, directions = back.move(beams.origins), beams.directions @ placed.rotation
     hits = caster.shoot(origins, directions)
@@ -86,20 +117,45 @@ def spoken_of(model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[
     on = np.abs(ranges - distance) * cosine <= limits.inlier
     # A beam a hair within the outline says nothing: the pose is no better than that.
     passed = np.flatnonzero(through)
-    deep = within(caster, origins[met[passed]], directions[met[passed]], ranges[passed] - limits.margin, limits.inlier)
+    deep = within(
+        caster,
+        origins[met[passed]],
+        directions[met[passed]],
+        ranges[passed] - limits.margin,
+        limits.edge or limits.inlier,
+    )
     edge = np.zeros(len(met), np.bool_)
     edge[passed[~deep]] = True
     beside = ~(on | through | hidden)
-    return Spoken(*(float(area[which & ~edge].sum()) for which in (on, beside, through, hidden)))
+    if design is not None and beside.any():
+        # Steel lies on steel: a plate of 10 mm on a flange is nearer to it than beams of free space tell apart. Half a
+        # millimetre: faces that lie on each other hide nothing of each other.
+        some = np.flatnonzero(beside)
+        theirs = beams.take(met[some]).moved(np.zeros(3) if offset is None else offset)
+        behind = some[design.met(model.name, theirs, limits.inlier) < distance[some] - 5e-4]
+        beside[behind], hidden[behind] = False, True
+    whose, said = beams.scanner[met], [each & ~edge for each in (on, beside, through, hidden)]
+    return np.stack([np.bincount(whose[each], area[each], len(scanners)) for each in said], axis=1)
 
 
 class Towards(NamedTuple):
-    """Beams that go towards a model: origins, directions (B, 3), ranges, solid angles of their pixels (B,)."""
+    """Beams that go towards a model: origins, directions (B, 3), ranges, solid angles of their pixels, whose (B,)."""
 
     origins: Floats
     directions: Floats
     ranges: Floats
     angles: Floats
+    scanner: NDArray[np.intp]
+
+    def take(self, which: NDArray[np.intp]) -> Towards:
+        """Some of them."""
+        return Towards(
+            self.origins[which], self.directions[which], self.ranges[which], self.angles[which], self.scanner[which]
+        )
+
+    def moved(self, by: Floats) -> Towards:
+        """The same from elsewhere, (3,)."""
+        return self._replace(origins=self.origins + by)
 
     def ends(self) -> Floats:
         """Where they ended, (B, 3)."""
@@ -108,22 +164,28 @@ class Towards(NamedTuple):
 
 def towards(model: Model, placed: Pose, scanners: Sequence[Beams]) -> Towards:
     """The beams that go towards a placed model, MOST_BEAMS of them where there are more."""
+    return beams_to(placed.move(model.samples.points), model.spacing, scanners, MOST_BEAMS)
+
+
+def beams_to(points: Floats, spacing: float, scanners: Sequence[Beams], most: float = np.inf) -> Towards:
+    """The beams that go by points (N, 3) within their spacing, metres; `most` of them where there are more."""
     from scanfind.kernels.beams import beams_of, pixels_towards
 
-    points, reach, pixels = placed.move(model.samples.points), REACH_SPACINGS * model.spacing, []
+    reach, pixels = REACH_SPACINGS * spacing, []
     for scanner in scanners:
         met, found = np.zeros(len(scanner.nearest), np.bool_), np.empty(len(scanner.nearest), np.int64)
         count = pixels_towards(points, scanner.origin, reach, scanner.edge, scanner.nearest, met, found)
         pixels.append(found[:count])
-    share = min(1.0, MOST_BEAMS / max(sum(map(len, pixels)), 1))
-    asked_for = [Towards(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))]
-    for scanner, some in zip(scanners, pixels, strict=True):
+    share = min(1.0, most / max(sum(map(len, pixels)), 1))
+    asked_for = [Towards(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, np.intp))]
+    for number, (scanner, some) in enumerate(zip(scanners, pixels, strict=True)):
         asked = some[lots(some) < share]
         directions, ranges, angles = np.empty((len(asked), 3)), np.empty(len(asked)), np.empty(len(asked))
         beams_of(asked, scanner.nearest, scanner.edge, directions, ranges, angles)
         # Each of those asked stands for as many as were left out.
         origins = np.broadcast_to(scanner.origin, directions.shape)
-        asked_for.append(Towards(origins, directions, ranges, angles / share))
+        whose = np.full(len(asked), number)
+        asked_for.append(Towards(origins, directions, ranges, angles / share, whose))
     return Towards(*(np.concatenate(column) for column in zip(*asked_for, strict=True)))
 
 

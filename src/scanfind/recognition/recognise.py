@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations
 from math import ceil, log
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -11,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.assembly import Assemblies, Explained, View
-from scanfind.design.elements import LEAST_LOOKED_AT, Element, elements_of, placements_of
+from scanfind.design.elements import LEAST_LOOKED_AT, Element, assigned, elements_of, open_slide, placements_of, said_by
 from scanfind.detection import Detection, Motion, Refused
-from scanfind.evidence.free_space import Limits, Spoken, caster_of, spoken_of, towards
+from scanfind.evidence.ends import slid
+from scanfind.evidence.free_space import Design, Limits, Spoken, caster_of, spoken_by_each, towards
+from scanfind.evidence.rays import RayCaster
 from scanfind.evidence.verify import (
     ROUGHLY_KNOWN,
     Evidence,
@@ -33,17 +36,18 @@ from scanfind.fit.refine import Refined, covariance_of, held, icp, shrinking, tr
 from scanfind.library.near_surface import near_model, signed_distances
 from scanfind.pose import Pose
 from scanfind.priors.allowed import OUTSIDE, why_not
+from scanfind.recognition.swaps import GAIN, explained, looked_at, onto, pairs_alike
 from scanfind.search.hypotheses import Hypotheses, joined, model_arrays
 from scanfind.search.lines import LineSearch
 from scanfind.search.surface import Search
 
 if TYPE_CHECKING:
-    from scanfind.evidence.rays import RayCaster
     from scanfind.grid.scene import Scene
     from scanfind.grid.surfels import Surfels
     from scanfind.kernels.distance import NearSurface
     from scanfind.library import JointTable
     from scanfind.library.model import Model
+    from scanfind.mesh import Placement
     from scanfind.parameters import Parameters
 
 Floats = NDArray[np.float64]
@@ -65,9 +69,13 @@ NET_PENALTY = 2.0
 WEARY = 12  # poses of a model tried in parts, from which on only what comes closer than any of these is tried
 DRAWN_IN_CELLS = (2.0, 0.75)  # of the largest: how far off its design an element is met at once …
 FARTHER_IF = 1.2  # … where so many more of its samples meet the scan there than about the design
+# Where an element that is not in its place is looked for beside it, across its length; and how far off it then may be.
+AROUND_M, AROUND_MOST_M = (-0.04, 0.0, 0.04), 0.12
 IN_PLACE_M = 0.06  # what ICP carried no farther off is still where the design puts it
 ON_BEAMS_CELLS, ON_BEAMS_STEPS = 1.5, 2  # how near the surface beams end that a pose is fitted to, and how often
 TOLD_BY_LINES = 12  # poses that these speak for, refined whatever the coarse surfels say
+EDGE_INLIERS = 2.0  # a laser's spot is a centimetre wide at 10 m: nearer to the outline some of it went past
+ALONG = 0.95  # cosine between a slide and one that is the same
 REFUSED_SHOWN = 3  # of each model: what came closest
 
 
@@ -81,6 +89,7 @@ class Candidate(NamedTuple):
         conflicting poses are ranked
     whole : its parts, where they were fitted: of a pose that is believed by them alone
     in_place : the design puts it there; what adjoins it by design may share its surface
+    instead_of : the element in whose place it stands, where the two were swapped
     """
 
     model: int
@@ -93,6 +102,7 @@ class Candidate(NamedTuple):
     area: float
     whole: Explained | None = None
     in_place: bool = False
+    instead_of: Placement | None = None
 
 
 class Standing(NamedTuple):
@@ -107,7 +117,7 @@ class Recognition:
 
     def __init__(
         self, scene: Scene, models: Sequence[Model], table: JointTable, parameters: Parameters, seed: int, jobs: int,
-        standing: Sequence[Standing] = (),
+        standing: Sequence[Standing] = (), design: Design | None = None,
     ) -> None:  # fmt: skip
         self.scene, self.models, self.parameters, self.jobs = scene, models, parameters, jobs
         self.arrays = model_arrays(models)
@@ -135,6 +145,8 @@ class Recognition:
         self._the_same = diameters / 1000.0
         self._drawn_in = diameters / 10.0
         self._casters: dict[int, RayCaster] = {}
+        self._places: list[Placement] = []
+        self._design = design
         self._near: dict[int, NearSurface] = {}
         view = View(scene, self._fine, self._thin, self.signed, parameters.verify)
         self._assemblies = Assemblies(models, view, parameters.assembly, self.blind)
@@ -202,6 +214,7 @@ class Recognition:
                 for number, poses in enumerate(designs)
                 if (some := poses[start : start + kept])
             ]
+            self._places = [each for model in self.models for each in placements_of(model)[start : start + kept]]
             yield joined(placed)
 
     def progress(self) -> float:
@@ -246,12 +259,30 @@ class Recognition:
         farther = far.matched > FARTHER_IF * near.matched
         start = joined([near.hypotheses, far.hypotheses]).take(np.arange(len(farther)) + len(farther) * farther)
         found = self._icp_fine(start)
-        for k, number in enumerate(hypotheses.models):
-            design, pose = (Pose(h.rotations[k], h.translations[k]) for h in (hypotheses, found.hypotheses))
-            pose = held(design, pose, found.hessians[k], self.arrays.centres[number], float(self.arrays.radii[number]))
-            found.hypotheses.rotations[k], found.hypotheses.translations[k] = pose.rotation, pose.translation
+        self._hold(found, hypotheses)
         both = joined([hypotheses, found.hypotheses])
         return Refined(both, np.tile(found.hessians, (2, 1, 1)), np.tile(found.matched, 2), np.tile(found.rms, 2))
+
+    def _hold(self, found: Refined, designs: Hypotheses) -> None:
+        """Draw refined poses back to their designs along what the scan hardly fixes."""
+        for k, number in enumerate(designs.models):
+            design, pose = (Pose(h.rotations[k], h.translations[k]) for h in (designs, found.hypotheses))
+            pose = held(design, pose, found.hessians[k], self.arrays.centres[number], float(self.arrays.radii[number]))
+            found.hypotheses.rotations[k], found.hypotheses.translations[k] = pose.rotation, pose.translation
+
+    def _around(self, asked: Candidate) -> Candidate:
+        """The best of poses that ICP reaches from beside the design's, across its length, held as that one is.
+
+        What is thinner than it was moved is not drawn in from there: a plate of 8 mm that stands 60 mm off has
+        other surfaces nearer to its place than its own.
+        """
+        points, pose = self.models[asked.model].samples.points, Pose(asked.rotation, asked.translation)
+        across = pose.turn(np.eye(3)[np.argsort(np.ptp(points, axis=0), kind="stable")[:2]])
+        shifts = [one * across[0] + other * across[1] for one in AROUND_M for other in AROUND_M if one or other]
+        starts = self._placements(asked.model, [Pose(pose.rotation, pose.translation + shift) for shift in shifts])
+        found = self._icp_fine(self._icp_coarse(starts).hypotheses)
+        self._hold(found, self._placements(asked.model, [pose] * len(shifts)))
+        return max([asked, *self.candidates(found, in_place=True)], key=lambda candidate: candidate.score)
 
     def _on_beams(self, refined: Refined, some: NDArray[np.bool_]) -> Refined:
         """Refined poses, some of them (H,) fitted to where beams ended that went towards them.
@@ -329,7 +360,7 @@ class Recognition:
         """Refined poses with their evidence; in_place : of where the design puts the models."""
         self._fit_near(refined.hypotheses, ceil(self.parameters.verify.gate_cells))
         found = []
-        for k, seen in enumerate(self._evidence(refined.hypotheses)):
+        for k, seen in enumerate(self._evidence(refined.hypotheses, in_place=in_place)):
             number = int(refined.hypotheses.models[k])
             # What a pose explains of the scene, in samples; what beams passed through counts double.
             net = (seen.telling - NET_PENALTY * seen.penalty()) * seen.samples
@@ -342,8 +373,8 @@ class Recognition:
             )  # fmt: skip
         return found
 
-    def _evidence(self, hypotheses: Hypotheses) -> list[Evidence]:
-        """What surfels and beams say of poses near which the fine surfels are fitted."""
+    def _evidence(self, hypotheses: Hypotheses, *, in_place: bool) -> list[Evidence]:
+        """What surfels and beams say of poses near which the fine surfels are fitted; in_place : see `candidates`."""
         verify = self.parameters.verify
         support = gather_support(
             hypotheses, self.scene, self._fine, self._thin, self.arrays, self.signed, verify, self.jobs
@@ -351,16 +382,27 @@ class Recognition:
         lines = self._lines.beyond_chance(hypotheses) if self._lines else np.zeros(len(support))
         found = []
         for seen, on_lines, number, rotation, translation in zip(support, lines, *hypotheses[:3], strict=True):
-            spoken = self._spoken_of(int(number), Pose(rotation, translation))
+            spoken = self._spoken_of(int(number), Pose(rotation, translation), in_place=in_place)
             against = ROUGHLY_KNOWN if self.models[number].mesh is None else 1.0
             found.append(Evidence(*seen[:-1], spoken, seen.claims, float(on_lines), against))
         return found
 
-    def _spoken_of(self, number: int, placed: Pose) -> Spoken:
-        """What beams say of a model at a pose relative to the grid's offset."""
+    def _spoken_of(self, number: int, placed: Pose, *, in_place: bool = False) -> Spoken:
+        """What beams say of a model at a pose relative to the grid's offset; in_place : see `candidates`."""
+        return Spoken(*self._spoken_by_each(number, placed, in_place=in_place).sum(axis=0).tolist())
+
+    def _spoken_by_each(self, number: int, placed: Pose, *, in_place: bool = False) -> Floats:
+        """What the beams of each of S scanners say, rows as of Spoken, (S, 4)."""
+        return spoken_by_each(
+            self.models[number], self._caster(number), placed, self.scene.beams, self._limits(in_place=in_place),
+            self._design if in_place else None, self.scene.fine.cells.offset,
+        )  # fmt: skip
+
+    def _limits(self, *, in_place: bool = False) -> Limits:
+        """When a beam is on a surface, beside it, or through; in_place : see `candidates`."""
         verify, level = self.parameters.verify, self._fine
-        limits = Limits(level.inlier, level.margin(verify), verify.least_facing)
-        return spoken_of(self.models[number], self._caster(number), placed, self.scene.beams, limits)
+        edge = EDGE_INLIERS * level.inlier if in_place else 0.0
+        return Limits(level.inlier, level.margin(verify), verify.least_facing, edge)
 
     def _caster(self, number: int) -> RayCaster:
         """The surface of a model, made ready for beams when first asked for."""
@@ -375,17 +417,28 @@ class Recognition:
         it could be taken for. What ICP carried away from there must stand as one found anywhere would.
         """
         found, verify, claimed = self.candidates(refined, in_place=True), self.parameters.verify, self._no_rows()
-        elsewhere = []
-        for asked, moved in zip(found[: len(found) // 2], found[len(found) // 2 :], strict=True):
-            best = max(moved, asked, key=lambda candidate: candidate.score)
-            if self._apart(best, asked) > IN_PLACE_M:
+        elsewhere, missed = [], []
+        asked_all, moved_all = found[: len(found) // 2], found[len(found) // 2 :]
+        bests = [self._better_in_place(*pair) for pair in zip(moved_all, asked_all, strict=True)]
+        swapped = {} if self.blind else self._swapped(bests)
+        for k, (asked, best) in enumerate(zip(asked_all, bests, strict=True)):
+            if k in swapped:
+                self.believed.append(swapped[k])
+            elif self._apart(best, asked) > IN_PLACE_M:
                 elsewhere.append(best._replace(score=score(best.evidence, self.blind, verify), in_place=False))
             elif reason := self._why_not_in_place(best):
                 self._refused.append((best, reason))
+                missed.append(asked)
             else:
                 self.believed.append(best)
         for candidate in self.believed:
             self._claim(candidate, claimed)
+        for asked in missed if not self.blind else ():
+            best = self._around(asked)
+            near = self._apart(best, asked) < AROUND_MOST_M and not self._shares(best, claimed)
+            if near and not self._why_not_in_place(best):
+                self.believed.append(best)
+                self._claim(best, claimed)
         for candidate in sorted(elsewhere, key=lambda c: -c.area):
             if reason := self._why_not_known(candidate) or why_refused(candidate.evidence, self.blind, verify):
                 self._refused.append((candidate, reason))
@@ -393,6 +446,53 @@ class Recognition:
                 self.believed.append(candidate)
                 self._claim(candidate, claimed)
         self._settled(claimed)
+
+    def _better_in_place(self, moved: Candidate, asked: Candidate) -> Candidate:
+        """Of a pose as the design gives it and as ICP leaves it the better; one carried off only if the other fails."""
+        best = max(moved, asked, key=lambda candidate: candidate.score)
+        return asked if self._apart(best, asked) > IN_PLACE_M and not self._why_not_in_place(asked) else best
+
+    def _swapped(self, bests: Sequence[Candidate]) -> dict[int, Candidate]:
+        """By number of the place what stands in it, where two elements stand in each other's.
+
+        bests : of the place of each element, what the design has there, as it was found
+        """
+        alike, stand_ins, told = pairs_alike(self.models), {}, []
+        for places in combinations(range(len(bests)), 2):
+            pair = [bests[k] for k in places]
+            if tuple(sorted(each.model for each in pair)) not in alike:
+                continue
+            gains = []
+            for here, there in (places, places[::-1]):
+                is_there, model = bests[here].evidence.spoken, bests[there].model
+                if (here, model) not in stand_ins:
+                    stand_ins[here, model] = self._instead(bests[here], model, self._places[here])
+                more = explained(stand_ins[here, model].evidence.spoken) - explained(is_there)
+                gains.append(more / max(looked_at(is_there), 1e-300))
+                if gains[-1] < GAIN:
+                    break
+            else:
+                told.append((sum(gains), places))
+        found: dict[int, Candidate] = {}
+        for _, (one, other) in sorted(told, reverse=True):
+            instead = {one: stand_ins[one, bests[other].model], other: stand_ins[other, bests[one].model]}
+            if not found.keys() & instead.keys() and not any(map(self._why_not_in_place, instead.values())):
+                found |= instead
+        return found
+
+    def _instead(self, stands: Candidate, model: int, place: Placement) -> Candidate:
+        """Another model where one stands, the way round that beams speak for."""
+        pose = Pose(stands.rotation, stands.translation)
+        ways = [pose @ way for way in onto(self.models[model], self.models[stands.model])]
+        best = max(ways, key=lambda way: explained(self._spoken_of(model, way)))
+        start = self._placements(model, [best])
+        refined = self._icp_fine(start)
+        self._hold(refined, start)
+        asked, found = (
+            self.candidates(each, in_place=True)[0] for each in (refined._replace(hypotheses=start), refined)
+        )
+        better = asked if self._apart(found, asked) > IN_PLACE_M else found
+        return better._replace(instead_of=place)
 
     def _why_not_in_place(self, candidate: Candidate) -> str:
         """Why an element is not believed to stand where the design puts it; empty where it is."""
@@ -601,18 +701,68 @@ class Recognition:
             support=seen.support(), visible_support=seen.visible_support(), penalty=seen.penalty(),
             coverage=seen.support(), rms_m=seen.rms, unobservable=self._unobservable(found),
             covariance=covariance_of(found.hessian, found.rms, radius, below) if np.isfinite(found.rms) else None,
-            pivot=triple(pivot),
+            pivot=triple(pivot), instead_of=found.instead_of.name if found.instead_of else "",
             parts=whole.parts if whole else (),
         )  # fmt: skip
 
-    def elements(self, number: int, detections: Sequence[Detection]) -> list[Element]:
-        """What became of each element of the design that is of a model; detections : as they are reported."""
-        offset = self.scene.fine.cells.offset
+    def elements(self, number: int, detections: Sequence[Detection], stations: Floats) -> list[Element]:
+        """What became of each element of the design that is of a model.
 
-        def spoken_at(design: Pose) -> Spoken | None:
-            return None if self.blind else self._spoken_of(number, Pose(design.rotation, design.translation - offset))
+        detections : as they are reported; stations : where all of them stood, in order, (S, 3)
+        """
+        return elements_of(
+            self.models[number], detections, lambda pose: self._said_at(number, pose), self._numbers(stations)
+        )
 
-        return elements_of(self.models[number], detections, spoken_at)
+    def at_its_ends(self, number: int, found: Detection, design: Pose) -> Detection:
+        """A detection slid to where beams say its ends are, where its faces do not tell and they refute the design's.
+
+        design : scene_from_model as the design has it, in the scans' own frame
+        """
+        model, placed = self.models[number], found.scene_from_model
+        along = open_slide(model, found)
+        if along is None or self.blind or found.parts or found.covariance is None or found.pivot is None:
+            return found
+        centre = model.symmetry.centre[None]
+        alike = model.symmetry.nearest(design, placed.rotation)
+        from_here = float((alike.move(centre) - placed.move(centre))[0] @ along)
+        here = Pose(placed.rotation, placed.translation - self.scene.fine.cells.offset)
+        told = slid(
+            model, self._caster(number), here, along, from_here, self.scene.beams, self._limits(), self._design,
+            self.scene.fine.cells.offset,
+        )  # fmt: skip
+        if told is None:
+            return found
+        step, covariance = told.by * along, found.covariance.copy()
+        covariance[3:, 3:] += told.sigma**2 * np.outer(along, along)
+        own = placed.rotation.T @ along
+        others = [each for each in found.unobservable if each.kind != "slide" or abs(np.dot(each.axis, own)) < ALONG]
+        return replace(
+            found, scene_from_model=Pose(placed.rotation, placed.translation + step), covariance=covariance,
+            pivot=triple(np.array(found.pivot) + step), slide=triple(along),
+            unobservable=(*others, Motion("slide", triple(own), triple(centre[0]), told.sigma)),
+        )  # fmt: skip
+
+    def with_stations(self, number: int, found: Detection, stations: Floats) -> Detection:
+        """A detection of a model with what each station says of it; stations : see `elements`."""
+        said = self._said_at(number, found.scene_from_model)
+        return replace(found, stations=said_by(said, self._numbers(stations)))
+
+    def with_ends(self, number: int, detections: Sequence[Detection]) -> dict[int, Detection]:
+        """By id the detections of a model that stand for an element, each `at_its_ends`."""
+        model, places = self.models[number], placements_of(self.models[number])
+        taken = assigned(model, places, [one for one in detections if one.model == model.name])
+        return {one.id: self.at_its_ends(number, one, places[place].design_from_model) for place, one in taken.items()}
+
+    def _said_at(self, number: int, pose: Pose) -> Floats:
+        """What the beams of each scanner say of a model at a pose in the scans' own frame: see `_spoken_by_each`."""
+        here = Pose(pose.rotation, pose.translation - self.scene.fine.cells.offset)
+        return self._spoken_by_each(number, here, in_place=self._design is not None)
+
+    def _numbers(self, stations: Floats) -> list[int]:
+        """Of each scanner the number, from 1, of the station that stood where it did."""
+        stood = [scanner.origin + self.scene.fine.cells.offset for scanner in self.scene.beams]
+        return [1 + int(np.nanargmin(np.linalg.norm(stations - where, axis=1))) for where in stood]
 
     def reach(self) -> float:
         """How far from its surface points of an instance may lie, metres."""
@@ -679,6 +829,19 @@ class Recognition:
             chance = self.search.chance_missed()
             told.append(f"the time limit ended the search; an instance may have been missed with chance {chance:.0%}")
         return told
+
+
+def design_of(models: Sequence[Model]) -> Design | None:
+    """Elements where the design has them; None where it has no meshes."""
+    placed = [
+        (model.name, model.mesh, each.design_from_model)
+        for model in models
+        if model.mesh is not None
+        for each in placements_of(model)
+    ]
+    if not placed:
+        return None
+    return Design(RayCaster([(mesh, pose) for _, mesh, pose in placed]), tuple(name for name, _, _ in placed))
 
 
 def closest(refused: list[tuple[Candidate, str]]) -> list[tuple[Candidate, str]]:

@@ -119,10 +119,26 @@ class Sizes:
         """A detection with its parts fitted to raw points (N, 3) around it, scan frame; None: it has no parts."""
         return found if points is None else self._of(found.model).measured(found, points)
 
-    def elements(self, detections: Sequence[Detection]) -> list[Element]:
-        """What became of each element of the design, in the order of the models."""
+    def with_stations(self, found: Detection, stations: Floats) -> Detection:
+        """A detection with what each station says of it; stations : where all of them stood, in order, (S, 3)."""
+        search = self._of(found.model)
+        number = next(number for number, model in enumerate(search.models) if model.name == found.model)
+        return search.with_stations(number, found, stations)
+
+    def with_ends(self, detections: Sequence[Detection]) -> list[Detection]:
+        """Detections, those that stand for an element slid to where beams say that their ends are."""
         told = {
-            model.name: search.elements(number, detections)
+            key: one
+            for search in self.all
+            for number in range(len(search.models))
+            for key, one in search.with_ends(number, detections).items()
+        }
+        return [told.get(one.id, one) for one in detections]
+
+    def elements(self, detections: Sequence[Detection], stations: Floats) -> list[Element]:
+        """What became of each element of the design, in the order of the models; stations : see `with_stations`."""
+        told = {
+            model.name: search.elements(number, detections, stations)
             for search in self.all
             for number, model in enumerate(search.models)
         }

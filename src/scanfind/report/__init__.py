@@ -20,7 +20,7 @@ from scanfind.report.page import page_of
 from scanfind.report.pdf import pdf_of
 from scanfind.report.tables import csv_of, xlsx_of
 from scanfind.results import read_results
-from scanfind.tolerances import allowed_off, load_profile
+from scanfind.tolerances import load_profile, profile_in
 from scanfind.tolerances.discs import discs_of
 
 __all__ = ["MOST_POINTS", "WRITERS", "write_report"]
@@ -68,8 +68,7 @@ def write_report(
     if not _is_finite(results.model_dump()):
         msg = f"{result_dir}: its results.json holds a number that is none (NaN or infinite): search again"
         raise UnreadableFileError(msg)
-    told = None if results.allowed_m is None else allowed_off(results.allowed_m)
-    profile = told if tolerance is None else load_profile(tolerance)
+    profile = profile_in(results) if tolerance is None else load_profile(tolerance)
     models = models_of(folder)
     discs = {key: disc for model in models for key, disc in discs_of(model).items()}
     content = Content(

@@ -299,7 +299,7 @@ def _write_csv(path: Path, results: schema.Results) -> None:
 
 ELEMENT_COLUMNS = (
     "global_id", "ifc_class", "name", "model", "status", "verdict", "detection", "shift_x_m", "shift_y_m", "shift_z_m",
-    "turn_deg", "off_m", "on", "beside", "through", "hidden", "why",
+    "turn_deg", "off_m", "on", "beside", "through", "hidden", "why", "verdict_why",
 )  # fmt: skip
 
 
@@ -313,7 +313,7 @@ def _write_elements(path: Path, results: schema.Results) -> None:
             out.writerow([
                 each.global_id, each.ifc_class, each.name, each.model, each.status, each.verdict, each.detection,
                 *(each.shift_m or (None, None, None)), turn_deg, each.off_m, each.on, each.beside, each.through,
-                each.hidden, each.why,
+                each.hidden, each.why, each.verdict_why,
             ])  # fmt: skip
 
 

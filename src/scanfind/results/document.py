@@ -18,7 +18,17 @@ from pydantic_core import to_jsonable_python
 from scanfind.clock import STAGES
 from scanfind.design.alignment import Alignment
 from scanfind.design.elements import Element
-from scanfind.detection import Detection, Deviation, Dimension, Findings, Motion, PartFit, Refused, SceneScan
+from scanfind.detection import (
+    Detection,
+    Deviation,
+    Dimension,
+    Findings,
+    Motion,
+    PartFit,
+    Refused,
+    SceneScan,
+    StationSays,
+)
 from scanfind.mesh import Placement
 from scanfind.pose import Pose
 from scanfind.results import schema
@@ -72,8 +82,8 @@ def document(
         models=[model.model_copy(update={"expected": findings.expected.get(model.name)}) for model in models],
         detections=[_detection_entry(found, *files.get(found.id, (None, None))) for found in findings],
         refused=[_refused_entry(refused) for refused in findings.refused],
-        elements=[_element_entry(element, findings.allowed_m) for element in findings.elements],
-        allowed_m=findings.allowed_m,
+        elements=[_element_entry(element) for element in findings.elements],
+        profile=None if findings.profile is None else findings.profile.tables(),
         alignment=None if findings.alignment is None else _alignment_entry(findings.alignment),
         remainder=remainder,
         notes=list(findings.notes),
@@ -83,10 +93,10 @@ def document(
 
 
 def findings_of(results: schema.Results) -> Findings:
-    """What `document` was given, made back from what it gave; all but the points."""
+    """What `document` was given, made back from what it gave; all but the points and the tolerance profile."""
     findings = Findings([_detection(entry) for entry in results.detections])
     findings.refused = [_refused(entry) for entry in results.refused]
-    findings.elements, findings.allowed_m = [_element(entry) for entry in results.elements], results.allowed_m
+    findings.elements = [_element(entry) for entry in results.elements]
     findings.alignment = None if results.alignment is None else _alignment(results.alignment)
     findings.scans = [SceneScan(scan.path, scan.points, scan.dropped, tuple(scan.stations_m)) for scan in results.scans]
     findings.shift, findings.crs, findings.notes = results.shift_m, results.crs, list(results.notes)
@@ -170,6 +180,8 @@ def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -
         sigma_rad=_or_none(found.sigma_rad),
         parts=[_part_entry(part) for part in found.parts],
         dimensions=[_dimension_entry(each) for each in found.dimensions],
+        stations=_station_entries(found.stations),
+        instead_of=found.instead_of,
     )
 
 
@@ -234,7 +246,7 @@ def _refused_entry(refused: Refused) -> schema.RefusedEntry:
     )
 
 
-def _element_entry(element: Element, allowed_m: float | None) -> schema.ElementEntry:
+def _element_entry(element: Element) -> schema.ElementEntry:
     placement = element.placement
     return schema.ElementEntry(
         global_id=placement.global_id,
@@ -242,7 +254,9 @@ def _element_entry(element: Element, allowed_m: float | None) -> schema.ElementE
         name=placement.name,
         model=element.model,
         status=element.status,
-        verdict=element.verdict(allowed_m),
+        verdict=element.verdict,
+        verdict_why=element.verdict_why,
+        stations=_station_entries(element.stations),
         detection=element.detection,
         design_from_model=rows(placement.design_from_model),
         shift_m=element.shift_m,
@@ -255,6 +269,10 @@ def _element_entry(element: Element, allowed_m: float | None) -> schema.ElementE
         why=element.why,
         built_from_design=None if element.built_from_design is None else rows(element.built_from_design),
     )
+
+
+def _station_entries(stations: Iterable[StationSays]) -> list[schema.StationEntry]:
+    return [schema.StationEntry(**each._asdict()) for each in stations]
 
 
 def _alignment_entry(alignment: Alignment) -> schema.AlignmentEntry:
@@ -307,7 +325,13 @@ def _detection(entry: schema.DetectionEntry) -> Detection:
             Dimension(each.name, each.kind, each.design, _or_nan(each.built), _or_nan(each.sigma), each.why)
             for each in entry.dimensions
         ),
+        stations=_stations(entry.stations),
+        instead_of=entry.instead_of,
     )
+
+
+def _stations(entries: Iterable[schema.StationEntry]) -> tuple[StationSays, ...]:
+    return tuple(StationSays(**entry.model_dump()) for entry in entries)
 
 
 def _motions(entries: Iterable[schema.MotionEntry]) -> tuple[Motion, ...]:
@@ -339,7 +363,8 @@ def _element(entry: schema.ElementEntry) -> Element:
     moved = None if entry.built_from_design is None else _pose(entry.built_from_design)
     return Element(
         placement, entry.model, entry.status, entry.detection, entry.shift_m, entry.turn_rad, entry.off_m, entry.on,
-        entry.beside, entry.through, entry.hidden, entry.why, moved,
+        entry.beside, entry.through, entry.hidden, entry.why, moved, entry.verdict, entry.verdict_why,
+        _stations(entry.stations),
     )  # fmt: skip
 
 

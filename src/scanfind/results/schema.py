@@ -144,6 +144,20 @@ class DimensionEntry(Entry):
     why: str = ""
 
 
+class StationEntry(Entry):
+    """What the beams of one station say of a placed model, as shares of the surface that those of all went to.
+
+    `station`: its number, from 1, among the `stations_m` of all scans in order. Stations that went to less than a
+    hundredth are left out.
+    """
+
+    station: int
+    on: float
+    beside: float
+    through: float
+    hidden: float
+
+
 class DetectionEntry(Entry):
     """One instance of one model. `isolated` and `pose` are files of the result folder, null where none was written.
 
@@ -158,7 +172,9 @@ class DetectionEntry(Entry):
     parts, `isolated` and `deviation` are of the parts where they were built.
 
     `dimensions` are what a drawing would give: of a model with round parts its flange faces and pipes, of another its
-    extents. They are empty for pieces of scan and free forms, and in results of an earlier version.
+    extents. They are empty for pieces of scan and free forms, and in results of an earlier version. `stations`: of
+    where it was found; empty where there are not several. `instead_of`: the element of the design in whose place it
+    stands, where two were swapped.
     """
 
     id: int
@@ -183,6 +199,8 @@ class DetectionEntry(Entry):
     sigma_rad: float | None = None
     parts: list[PartEntry] = []
     dimensions: list[DimensionEntry] = []
+    stations: list[StationEntry] = []
+    instead_of: str = ""
 
 
 class RefusedEntry(Entry):
@@ -202,14 +220,15 @@ class ElementEntry(Entry):
 
     `design_from_model`: where the design puts it, in the scan's frame (moved there by `alignment`, where there is one).
 
-    `status`: installed, uncertain, occluded, not_found, not_enough_data or no_data. `verdict`: in_tolerance or
-    out_of_tolerance, null where it was not found or no `allowed_m` was given. `detection`: the id of the instance taken
-    for it. `shift_m` of its middle, in the scan's axes, `turn_rad` by what angle it is turned, `off_m` how far the
-    point of its surface that moved the most did; all null where it was not found. `on`, `beside`, `through`, `hidden`:
-    what beams say at the design's place, as shares of the surface they went to: they ended on it, near it but not on
-    it, behind it, before it; null where no scanner position is known. `built_from_design` moves it from its place in
-    the design to where it stands, without the motions the scan hardly fixes: null unless it is installed, and in
-    results of an earlier version.
+    `status`: installed, uncertain, occluded, not_found, not_enough_data or no_data. `verdict`: in_tolerance,
+    out_of_tolerance or not_judged, `verdict_why` in words; null where it was not found or there is no `profile`.
+    `detection`: the id of the instance taken for it. `shift_m` of its middle, in the scan's axes, `turn_rad` by what
+    angle it is turned, `off_m` how far the point of its surface that moved the most did; all null where it was not
+    found. `on`, `beside`, `through`, `hidden`: what beams say at the design's place, as shares of the surface they went
+    to: they ended on it, near it but not on it, behind it, before it; null where no scanner position is known.
+    `built_from_design` moves it from its place in the design to where it stands, without the motions the scan hardly
+    fixes: null unless it is installed, and in results of an earlier version. `stations`: of the design's place; empty
+    where there are not several.
     """
 
     global_id: str
@@ -229,6 +248,8 @@ class ElementEntry(Entry):
     hidden: float | None
     why: str
     built_from_design: Matrix | None = None
+    verdict_why: str = ""
+    stations: list[StationEntry] = []
 
 
 class AlignmentEntry(Entry):
@@ -252,9 +273,10 @@ class Results(Entry):
     """results.json. `shift_m` was taken off while computing; every coordinate here has it added back.
 
     `tolerance_m` is within which points were isolated, null where they were not. `elements` are those of the design,
-    where a search was asked what became of it; `allowed_m` by how much they may be off. `made`: when this was written,
-    UTC as in 2026-11-22T17:30:00Z, null in results of an earlier version. `alignment`: null where scans and design are
-    in one frame.
+    where a search was asked what became of it; `profile` by how much they may be off, as a TOML file says it (see
+    docs/report.md). `allowed_m` says so in results of an earlier version: no point of theirs by more. `made`: when this
+    was written, UTC as in 2026-11-22T17:30:00Z, null in results of an earlier version. `alignment`: null where scans
+    and design are in one frame.
     """
 
     schema_: int = Field(SCHEMA, alias="schema")
@@ -270,12 +292,18 @@ class Results(Entry):
     detections: list[DetectionEntry]
     refused: list[RefusedEntry]
     elements: list[ElementEntry] = []
+    profile: dict[str, Any] | None = None
     allowed_m: float | None = None
     alignment: AlignmentEntry | None = None
     remainder: str | None = None
     notes: list[str] = []
     timings_s: dict[str, float]
     peak_memory_bytes: int
+
+    def measured(self) -> bool:
+        """Was what a drawing would dimension asked for?"""
+        asked: bool = self.parameters.get("isolate", {}).get("dimensions", False)
+        return asked
 
     def to_json(self) -> str:
         """The text of results.json: two blanks a level, keys in the order above, a list of plain values on one line."""

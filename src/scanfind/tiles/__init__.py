@@ -376,7 +376,8 @@ def isolate_all(
             surface = surface_of(job.folder, one.model, tolerance)
             fitted = polished(with_points, surface, job.parameters.refine, job.jobs)
         with clock("measure"):
-            if (plan := plan_in(job.folder, one.model)) and fitted.isolated is not None:
+            plan = plan_in(job.folder, one.model) if job.parameters.isolate.dimensions else None
+            if plan and fitted.isolated is not None:
                 fitted = dimensioned(fitted, plan, surface, fitted.isolated, stations, tolerance, jobs=job.jobs)
         points = fitted.isolated or cut_out
         try:

@@ -8,13 +8,15 @@ uncertain, so that nothing passes because nobody could look.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import degrees, hypot, inf
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scanfind.design.elements import IN_TOLERANCE, INSTALLED, OUT_OF_TOLERANCE
+from scanfind.design.elements import IN_TOLERANCE, INSTALLED, NOT_JUDGED, OUT_OF_TOLERANCE
 from scanfind.detection import ANGLE, FACE, LINEAR, PLACE, RADIUS
+from scanfind.results.document import document, model_entries
 from scanfind.results.explain import STATUS_WORDS, length
 from scanfind.results.schema import (
     DetectionEntry,
@@ -25,10 +27,14 @@ from scanfind.results.schema import (
     PartEntry,
     Results,
 )
-from scanfind.tolerances.discs import Disc
-from scanfind.tolerances.profile import OF_DIMENSIONS, Limit, Profile
+from scanfind.tolerances.discs import Disc, discs_of
+from scanfind.tolerances.profile import OF_DIMENSIONS, Limit, Profile, allowed_off, profile_of
 
-IN, OUT, NOT_JUDGED = IN_TOLERANCE, OUT_OF_TOLERANCE, "not_judged"
+if TYPE_CHECKING:
+    from scanfind.detection import Findings
+    from scanfind.library import ModelLibrary
+
+IN, OUT = IN_TOLERANCE, OUT_OF_TOLERANCE
 
 K = 2.0  # standard deviations: 95 % of them, were they normal
 LEAST_POINTS = 100  # of a percentile: five points beyond it
@@ -102,6 +108,35 @@ class Judgement:
     verdict: str
     why: str
     checks: tuple[Check, ...] = ()
+
+
+def judge_findings(findings: Findings, profile: Profile, models: ModelLibrary) -> None:
+    """Give the elements of an inspection their verdicts; models : all of the design."""
+    results = document(findings, models=model_entries(models), parameters={}, seed=0)
+    told = judge_results(results, profile, models).elements
+    findings.profile = profile
+    findings.elements = [
+        replace(each, verdict=entry.verdict, verdict_why=entry.verdict_why)
+        for each, entry in zip(findings.elements, told, strict=True)
+    ]
+
+
+def judge_results(results: Results, profile: Profile, models: ModelLibrary) -> Results:
+    """A result with other tolerances: nothing is searched again. models : all of the design."""
+    discs = {key: disc for model in models.models() for key, disc in discs_of(model).items()}
+    elements = []
+    for each in results.elements:
+        judgement = judge_element(profile, results, each, discs)
+        told = (judgement.verdict, judgement.why) if each.status == INSTALLED else (None, "")
+        elements.append(each.model_copy(update=dict(zip(("verdict", "verdict_why"), told, strict=True))))
+    return results.model_copy(update={"elements": elements, "profile": profile.tables(), "allowed_m": None})
+
+
+def profile_in(results: Results) -> Profile | None:
+    """The profile that a result was judged by; None where nobody said how far off elements may be."""
+    if results.profile is not None:
+        return profile_of(results.profile, "the result's profile")
+    return None if results.allowed_m is None else allowed_off(results.allowed_m)
 
 
 def judge_element(

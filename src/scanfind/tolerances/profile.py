@@ -11,7 +11,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from importlib import resources
-from math import isfinite, radians
+from math import inf, isfinite, radians
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -85,9 +86,35 @@ class Profile:
                 found |= rule.limits
         return found
 
+    def tables(self) -> dict[str, Any]:
+        """What a TOML file of this profile says; `profile_of` makes it back."""
+        rules = [
+            {kind: list(patterns) for kind, patterns in rule.patterns.items()}
+            | {key: {"limit": each.value / UNITS[key], "source": each.source} for key, each in rule.limits.items()}
+            for rule in self.rules
+        ]
+        return {"title": self.title, "rule": rules}
+
+
+def profile_allowing(what: float | str | PathLike[str] | Profile) -> Profile:
+    """What may be said of how far elements may be off: a length in metres, a preset's name, a TOML file, a profile.
+
+    Raises UsageError for a length that is none, and as `load_profile` does.
+    """
+    if isinstance(what, Profile):
+        return what
+    try:
+        metres = float(what)  # type: ignore[arg-type]  # a path is no number
+    except (TypeError, ValueError):
+        return load_profile(Path(what))  # type: ignore[arg-type]
+    if not 0.0 < metres < inf:
+        msg = f"allowed: a length above 0, in metres, or a tolerance profile, got {what}"
+        raise UsageError(msg)
+    return allowed_off(metres)
+
 
 def allowed_off(metres: float) -> Profile:
-    """The profile of `scanfind inspect --allowed`: no point of an element is farther from its place."""
+    """The profile of a mere length: no point of an element is farther from its place."""
     return Profile(
         f"No point off by more than {1e3 * metres:g} mm", (Rule({}, {"off_mm": Limit(metres, "--allowed")}),)
     )

@@ -1,0 +1,102 @@
+"""What slides along itself is measured by its ends; what the design hides; which models could be swapped."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from scanfind.evidence.ends import FIXED, slid
+from scanfind.evidence.free_space import Limits, caster_of, spoken_by_each
+from scanfind.grid.depth import Beams
+from scanfind.kernels.grid import NO_BEAM, cube_place, pack_beam
+from scanfind.library.model import Model, ModelParameters, build_model
+from scanfind.library.surface import SurfaceParameters
+from scanfind.pose import Pose
+from scanfind.recognition.recognise import design_of
+from scanfind.recognition.swaps import are_alike, onto, pairs_alike
+from scanfind.simulate.parts import blocks, box
+from scanfind.simulate.scanner import Scanner, scan
+from scanfind.simulate.scene import Scene, SceneObject
+
+Floats = NDArray[np.float64]
+
+LIMITS = Limits(0.006, 0.03, 0.25)
+ALONG = np.array([1.0, 0.0, 0.0])
+WALL = blocks("wall", [((-4.0, 3.0, -2.0), (4.0, 3.1, 3.0))])
+STATIONS = np.array([[-1.0, -4.0, 0.6], [2.0, -4.0, 1.2]])
+
+
+def bar(length: float = 2.0, width: float = 0.2) -> Model:
+    mesh = replace(box(length, width, width), name=f"bar {length:g}")
+    return build_model(mesh, ModelParameters(SurfaceParameters(samples=400)))
+
+
+def at(x: float) -> Pose:
+    return Pose(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+@cache
+def bar_seen(x: float) -> list[Beams]:
+    return seen(bar(), x)
+
+
+def seen(model: Model, x: float) -> list[Beams]:
+    """What two scanners keep of a bar before a wall."""
+    assert model.mesh is not None
+    scene = Scene((SceneObject("wall", WALL, Pose.identity()), SceneObject("bar", model.mesh, at(x))), STATIONS)
+    return [beams_about(cloud.xyz, where) for cloud, where in
+            zip(scan(scene, scanner=Scanner(step=0.004), seed=1).stations, STATIONS, strict=True)]  # fmt: skip
+
+
+def beams_about(points: Floats, origin: Floats) -> Beams:
+    nearest = np.full(6 * 360**2, NO_BEAM)
+    for way in points - origin:
+        pixel, packed = pack_beam(*cube_place(*way), 360, float(np.linalg.norm(way)))
+        nearest[pixel] = min(nearest[pixel], packed)
+    return Beams(origin, nearest, 360)
+
+
+@pytest.mark.parametrize("moved", [-0.08, -0.02, 0.05])
+@pytest.mark.parametrize("carried", [0.0, 0.03])
+def test_a_slide_is_measured_wherever_icp_left_it(moved: float, carried: float) -> None:
+    model = bar()
+    told = slid(model, caster_of(model), at(carried), ALONG, -carried, bar_seen(moved), LIMITS)
+    assert told is not None
+    assert carried + told.by == pytest.approx(moved, abs=max(FIXED * told.sigma, 0.005))
+    assert told.sigma < 0.01
+
+
+@pytest.mark.parametrize("carried", [-0.03, 0.0, 0.05])
+def test_what_stands_as_designed_is_not_slid(carried: float) -> None:
+    model = bar()
+    assert slid(model, caster_of(model), at(carried), ALONG, -carried, bar_seen(0.0), LIMITS) is None
+
+
+def test_what_the_design_has_in_front_hides_and_is_not_beside() -> None:
+    plate, cover = bar(), build_model(blocks("cover", [((-0.01, -0.01, -0.01), (2.01, 0.21, 0.21))]))
+    beams = seen(cover, 0.0)
+    alone = spoken_by_each(plate, caster_of(plate), at(0.0), beams, LIMITS).sum(axis=0)
+    assert alone[1] > 0.5 * alone.sum()
+    design = design_of([plate, cover])
+    told = spoken_by_each(plate, caster_of(plate), at(0.0), beams, LIMITS, design).sum(axis=0)
+    assert told[1] < 0.05 * told.sum()
+    assert told[3] > 0.9 * alone[1]
+
+
+def test_alike_are_those_of_one_section_whose_lengths_can_be_told_apart() -> None:
+    models = [bar(2.0), bar(2.1), bar(2.0, 0.21), bar(2.0, 0.3), bar(3.0)]
+    assert not are_alike(models[0], models[2])  # of one length
+    assert pairs_alike(models) == {(0, 1), (1, 2)}
+
+
+def test_a_model_is_put_onto_another_side_along_side_and_middle_to_middle() -> None:
+    one, other = bar(2.0), build_model(replace(box(0.2, 2.5, 0.2), name="up"))
+    low, high = other.samples.points.min(axis=0), other.samples.points.max(axis=0)
+    for way in onto(one, other):
+        points = way.move(one.samples.points)
+        np.testing.assert_allclose(0.5 * (points.min(axis=0) + points.max(axis=0)), 0.5 * (low + high), atol=0.01)
+        assert np.argmax(np.ptp(points, axis=0)) == 1
