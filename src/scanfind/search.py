@@ -122,8 +122,9 @@ class Search:
 
     def __init__(
         self, scene: Scene, models: Sequence[Model], table: JointTable, arrays: ModelArrays,
-        parameters: SearchParameters, seed: int, jobs: int,
+        parameters: SearchParameters, seed: int, jobs: int, learnt: Sequence[float] = (),
     ) -> None:  # fmt: skip
+        """learnt : of each model, the share of right pairs that found it elsewhere; 0, or nothing: nobody knows."""
         self.scene, self.models, self.table, self.arrays = scene, models, table, arrays
         self.parameters, self.seed, self.jobs = parameters, seed, jobs
         self.pairs = models[0].parameters.pairs
@@ -140,9 +141,11 @@ class Search:
         self.rounds, self.effort, self._last_share = 0, 0.0, 1.0
         self.pool = np.empty(0, np.intp)
         self._fill_pool()
-        self._expected = np.zeros(len(models))
+        self._finds = np.where(np.asarray(learnt) > 0.0, learnt, RIGHT_PAIR_FINDS) if len(learnt) else RIGHT_PAIR_FINDS
+        self._right, self._last_right = np.zeros(len(models)), np.zeros(len(models))
         self._served = np.zeros(len(models), np.bool_)  # models of which no further instance is wanted
-        self._learned = np.zeros((len(models), 2))  # hits, and what was shown, of the instances found
+        # Of the instances found: hits, and what they showed, in full rounds and in right pairs of one that shows λs.
+        self._learned = np.zeros((len(models), 3))
         self._look_for(parameters.overlap_ratio)
 
     def _look_for(self, overlap_ratio: float) -> None:
@@ -235,7 +238,7 @@ class Search:
 
     def chance_missed(self) -> float:
         """Chance to have missed an instance that shows λs of its surface, for the model worst served so far."""
-        expected = np.where(self._learned[:, 1] > 0.0, self.effort * self._rate(), self._expected)
+        expected = np.where(self._learned[:, 1] > 0.0, self.effort * self._rate(), self._finds * self._right)
         return exp(-float(expected.min(initial=np.inf, where=~self._served)))
 
     def _share(self) -> float:
@@ -252,7 +255,8 @@ class Search:
 
     def learn(self, model: int, hits: int, support: float) -> None:
         """Learn from an instance how often the last round hit it: pairs on it go with the square of what it shows."""
-        self._learned[model] += max(hits, 1), self._last_share * (support / self.parameters.overlap_ratio) ** 2
+        shown = (support / self.parameters.overlap_ratio) ** 2
+        self._learned[model] += max(hits, 1), self._last_share * shown, self._last_right[model] * shown
         self._look_for(self.parameters.overlap_ratio)  # others are looked for as at first
 
     def _rate(self) -> Floats:
@@ -286,6 +290,7 @@ class Search:
         drawn_here : pairs at each rung; drawn, tested : keys of those that met a second point, and of those tested
         """
         cells, fine, shown = len(self.table.offsets) - 1, self.scene.fine, self.parameters.overlap_ratio
+        self._last_right[:] = 0.0
         count = np.bincount(drawn, minlength=cells)
         # None of a feature that was not drawn was left out: without this a scan too small for a pair is never done.
         share = np.where(count > 0, np.bincount(tested, minlength=cells) / np.maximum(count, 1), 1.0)
@@ -302,8 +307,8 @@ class Search:
                 shell = 2.0 * model.parameters.pairs.tolerance * model.spacing
                 partners = on_it * len(keys) / samples**2 * 2.0 * self._draws.tolerance / shell
                 second_on_it = partners / max(self._draws.partners(rung), partners, 1e-9)
-                right = drawn_here * first_on_it * second_on_it * float(share[keys].mean())
-                self._expected[number] += RIGHT_PAIR_FINDS * right
+                self._last_right[number] += drawn_here * first_on_it * second_on_it * float(share[keys].mean())
+        self._right += self._last_right
 
 
 def shape_classes(bends: NDArray[np.floating], window: float) -> NDArray[np.int8]:
