@@ -15,7 +15,7 @@ import numpy as np
 import scanfind
 from benchmarks.common import ROOT, median, seeds_of, tell, write_csv
 from benchmarks.inspection import STEEL, changed, scanned
-from scanfind.elements import INSTALLED
+from scanfind.design.elements import INSTALLED
 from scanfind.mesh import Mesh
 from scanfind.models import read_models
 from scanfind.pose import random_rotation, rotation_vector

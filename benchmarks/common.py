@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 import scanfind
 from scanfind.cloud import CloudModel
-from scanfind.cloud_surface import sample_cloud
+from scanfind.library.cloud_surface import sample_cloud
+from scanfind.library.onto_itself import OntoItself
+from scanfind.library.surface import SurfaceParameters, sample_mesh
+from scanfind.library.symmetries import find_symmetry
 from scanfind.mesh import Mesh
-from scanfind.onto_itself import OntoItself
 from scanfind.pose import Pose
-from scanfind.surface import SurfaceParameters, sample_mesh
-from scanfind.symmetries import find_symmetry
 from scanfind.symmetry import Symmetry
 from scanfind.threads import available_cores
 

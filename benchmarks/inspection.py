@@ -16,7 +16,7 @@ import numpy as np
 import scanfind
 from benchmarks.common import ROOT, Floats, median, seeds_of, tell, write_csv
 from scanfind.cloud import PointCloud
-from scanfind.elements import INSTALLED, NOT_FOUND
+from scanfind.design.elements import INSTALLED, NOT_FOUND
 from scanfind.mesh import Mesh, Placement
 from scanfind.models import read_models
 from scanfind.simulate.parts import blocks

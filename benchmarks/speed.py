@@ -17,7 +17,7 @@ import scanfind
 from benchmarks.common import STAGES, Floats, median, seeds_of, tell, write_csv
 from benchmarks.shop import TARGETS, WARM_UP_POINTS
 from scanfind.find import models_of
-from scanfind.scene import first_cell
+from scanfind.grid.scene import first_cell
 from scanfind.simulate.scanner import scan
 from scanfind.simulate.scenes import shop
 

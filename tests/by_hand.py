@@ -9,15 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from scanfind.design.elements import INSTALLED, NOT_FOUND, Element
 from scanfind.detection import Detection, Findings, IsolatedPoints, SceneScan
-from scanfind.deviation import deviation_of
-from scanfind.elements import INSTALLED, NOT_FOUND, Element
+from scanfind.isolation.deviation import deviation_of
 from scanfind.library import ModelLibrary
+from scanfind.library.model import ModelParameters, build_model
+from scanfind.library.surface import SurfaceParameters
 from scanfind.mesh import Placement
-from scanfind.model import ModelParameters, build_model
 from scanfind.pose import Pose
 from scanfind.results import write_results
-from scanfind.schema import (
+from scanfind.results.schema import (
     DetectionEntry,
     DeviationEntry,
     ElementEntry,
@@ -31,7 +32,6 @@ from scanfind.schema import (
     Vector,
 )
 from scanfind.simulate.parts import blocks
-from scanfind.surface import SurfaceParameters
 
 STATIONS: list[Vector | None] = [(0.0, 0.0, 1.5), (4.0, 0.0, 1.5), (0.0, 4.0, 1.5)]
 

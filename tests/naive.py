@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from naive_simulate import first_hit
-from scanfind.free_space import Limits, Spoken
+from scanfind.evidence.free_space import Limits, Spoken
 from scanfind.pose import Pose
 
 Floats = NDArray[np.float64]

@@ -12,22 +12,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import scanfind
-from scanfind.alignment import CELL_M, Alignment, fitted, lies_at
 from scanfind.bim.wording import inspected as in_bim
 from scanfind.cli.tables import alignment_in_words
+from scanfind.design.alignment import CELL_M, Alignment, fitted, lies_at
+from scanfind.design.elements import INSTALLED
+from scanfind.design.thinned import Thinned
 from scanfind.detection import Detection
-from scanfind.document import findings_of
-from scanfind.elements import INSTALLED
 from scanfind.errors import AlignmentError
+from scanfind.fit.refine import triple
+from scanfind.library.model import Model, ModelParameters, build_model
+from scanfind.library.surface import SurfaceParameters
 from scanfind.mesh import Mesh, Placement
-from scanfind.model import Model, ModelParameters, build_model
 from scanfind.pose import Pose, random_rotation, rotation_from_vector, rotation_vector
-from scanfind.refine import triple
+from scanfind.results.document import findings_of
 from scanfind.simulate.parts import blocks, box, cylinder
 from scanfind.simulate.scanner import Scanner, scan
 from scanfind.simulate.scene import Scene, SceneObject
-from scanfind.surface import SurfaceParameters
-from scanfind.thinned import Thinned
 
 SMALL = ModelParameters(SurfaceParameters(samples=100))
 ODD = blocks("odd", [((0, 0, 0), (1, 0.3, 0.1)), ((0, 0, 0), (0.1, 0.3, 0.7)), ((0.5, 0, 0), (0.6, 0.1, 0.4))])

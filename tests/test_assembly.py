@@ -18,22 +18,22 @@ from scanfind.assembly.members import connected, members
 from scanfind.assembly.parts import Assembly, first_cut, merged, told_apart
 from scanfind.assembly.points import fitted_to_points
 from scanfind.detection import Findings
-from scanfind.document import document, findings_of
 from scanfind.find import find
+from scanfind.grid.scene import GridParameters
 from scanfind.library import ModelLibrary, ModelParameters
+from scanfind.library.pairs import PairParameters
+from scanfind.library.surface import SurfaceParameters, random_points
 from scanfind.mesh import Mesh
 from scanfind.models.parts import Part, join
-from scanfind.pairs import PairParameters
 from scanfind.parameters import PRESETS
 from scanfind.pose import Pose, rotation_from_vector, rotation_vector
-from scanfind.scene import GridParameters
+from scanfind.results.document import document, findings_of
 from scanfind.simulate.furniture import hall
 from scanfind.simulate.objects import RIGHT_ANGLE, Route
 from scanfind.simulate.parts import assemble
 from scanfind.simulate.scanner import Scanner, scan
 from scanfind.simulate.scene import Scene, SceneObject
 from scanfind.simulate.steel import hollow_beam
-from scanfind.surface import SurfaceParameters, random_points
 
 Floats = NDArray[np.float64]
 SURFACE = SurfaceParameters(samples=1500)

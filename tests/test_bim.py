@@ -19,17 +19,17 @@ from scanfind.bim.as_built import PROPERTY_SET, write_as_built
 from scanfind.bim.bcf import plain, write_bcf
 from scanfind.bim.views import Shown, Views
 from scanfind.cli import main
+from scanfind.design.elements import INSTALLED, NOT_FOUND, Element
 from scanfind.detection import Findings
-from scanfind.elements import INSTALLED, NOT_FOUND, Element
 from scanfind.errors import OutputError, UnreadableFileError, UsageError
 from scanfind.library import ModelLibrary
+from scanfind.library.model import ModelParameters
+from scanfind.library.surface import SurfaceParameters
 from scanfind.mesh import Mesh, Placement
-from scanfind.model import ModelParameters
 from scanfind.models import read_models
 from scanfind.pose import Pose
 from scanfind.results import write_results
 from scanfind.simulate.parts import box
-from scanfind.surface import SurfaceParameters
 from test_models_ifc import write
 
 SCHEMAS = Path(__file__).parent / "data" / "bcf-2.1"

@@ -16,8 +16,8 @@ from scanfind.cli.tables import closest, table, turned
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose
 from scanfind.results import read_results
+from scanfind.results.schema import ModelEntry, Results
 from scanfind.scans import open_writer, read_scan
-from scanfind.schema import ModelEntry, Results
 from scanfind.simulate.objects import pipe_spool
 from scanfind.simulate.scanner import scan
 from scanfind.simulate.scene import Scene, SceneObject

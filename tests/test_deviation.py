@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scanfind.deviation import deviation_of, within
 from scanfind.errors import InvalidGeometryError, UsageError
+from scanfind.isolation.deviation import deviation_of, within
 
 distances = st.lists(st.floats(-1.0, 1.0, width=32), min_size=1, max_size=40)
 

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 import scanfind
 from by_hand import folder_by_hand
 from scanfind.again import isolate_again
-from scanfind.detection import Detection
-from scanfind.elements import (
+from scanfind.design.elements import (
     IN_TOLERANCE,
     INSTALLED,
     NO_DATA,
@@ -28,18 +27,19 @@ from scanfind.elements import (
     off_by,
     status_at,
 )
-from scanfind.free_space import Spoken
+from scanfind.detection import Detection
+from scanfind.evidence.free_space import Spoken
+from scanfind.fit.refine import held
 from scanfind.library import ModelLibrary
+from scanfind.library.model import ModelParameters, build_model
+from scanfind.library.surface import SurfaceParameters
 from scanfind.mesh import Mesh, Placement
-from scanfind.model import ModelParameters, build_model
 from scanfind.pose import Pose, random_rotation, rotation_from_vector, rotation_vector
-from scanfind.refine import held
+from scanfind.recognition.sizes import SPAN, by_size
 from scanfind.results import MODELS, read_results
 from scanfind.simulate.parts import blocks, box, cylinder
 from scanfind.simulate.scanner import Scanner, scan
 from scanfind.simulate.scene import Scene, SceneObject
-from scanfind.sizes import SPAN, by_size
-from scanfind.surface import SurfaceParameters
 
 SMALL = ModelParameters(SurfaceParameters(samples=200))
 BRACKET = blocks("bracket", [((0, 0, 0), (1, 0.3, 0.1)), ((0, 0, 0), (0.1, 0.3, 0.7))])
@@ -183,8 +183,8 @@ def test_displacements_are_measured(inspected: scanfind.Findings) -> None:
 
 
 def test_elements_survive_the_result_folder(inspected: scanfind.Findings) -> None:
-    from scanfind.document import document, findings_of
-    from scanfind.schema import Results
+    from scanfind.results.document import document, findings_of
+    from scanfind.results.schema import Results
 
     inspected.allowed_m = 0.005
     told = document(inspected, models=[], parameters=scanfind.PRESETS["default"], seed=0)

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from by_hand import absent, detection, element, motion, part, results
-from scanfind.elements import INSTALLED, NO_DATA, NOT_ENOUGH_DATA, NOT_FOUND, OCCLUDED, UNCERTAIN
-from scanfind.explain import (
+from scanfind.design.elements import INSTALLED, NO_DATA, NOT_ENOUGH_DATA, NOT_FOUND, OCCLUDED, UNCERTAIN
+from scanfind.results.explain import (
     detection_sentences,
     element_sentences,
     headline,
@@ -17,7 +17,7 @@ from scanfind.explain import (
     shift_in_words,
     stations_in_words,
 )
-from scanfind.schema import ElementEntry, ScanEntry
+from scanfind.results.schema import ElementEntry, ScanEntry
 
 
 def told(each: ElementEntry) -> str:

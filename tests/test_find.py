@@ -12,25 +12,25 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import scanfind.sources
+import scanfind.scans.sources
 from scanfind.cloud import PointCloud
 from scanfind.detection import Findings
 from scanfind.errors import InvalidGeometryError, ScanfindError, UnreadableFileError, UsageError
 from scanfind.find import find
+from scanfind.grid.scene import GridParameters
 from scanfind.library import ModelLibrary
+from scanfind.library.model import ModelParameters
+from scanfind.library.pairs import PairParameters
+from scanfind.library.surface import SurfaceParameters
 from scanfind.mesh import Mesh
-from scanfind.model import ModelParameters
-from scanfind.pairs import PairParameters
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.pose import Pose, random_rotation
-from scanfind.scene import GridParameters
 from scanfind.simulate.furniture import hall
 from scanfind.simulate.objects import pipe_spool
 from scanfind.simulate.parts import blocks, box, cylinder
 from scanfind.simulate.scanner import Scanner, SimulatedScan, scan
 from scanfind.simulate.scene import Scene, SceneObject
 from scanfind.simulate.scenes import shop
-from scanfind.surface import SurfaceParameters
 
 Floats = NDArray[np.float64]
 
@@ -290,8 +290,8 @@ def test_threads_change_nothing(plain: Findings, jobs: int) -> None:
 
 
 def test_chunks_change_nothing(plain: Findings, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = scanfind.sources.chunks_of
-    monkeypatch.setattr(scanfind.sources, "chunks_of", lambda cloud: whole(cloud, 17_001))
+    whole = scanfind.scans.sources.chunks_of
+    monkeypatch.setattr(scanfind.scans.sources, "chunks_of", lambda cloud: whole(cloud, 17_001))
     assert_identical(plain, seek(clouds()))
 
 

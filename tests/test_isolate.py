@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scanfind.cloud import OrientedCloud, PointChunk
 from scanfind.detection import IsolatedPoints
 from scanfind.errors import InvalidGeometryError, UsageError
-from scanfind.isolate import IsolateParameters, Isolator, Placed, isolate
-from scanfind.near_surface import near_samples, near_triangles, signed_distances
+from scanfind.isolation.isolate import IsolateParameters, Isolator, Placed, isolate
+from scanfind.library.near_surface import near_samples, near_triangles, signed_distances
 from scanfind.pose import Pose
 
 Floats = NDArray[np.float64]

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from scanfind.cloud import CloudModel, OrientedCloud
 from scanfind.errors import LibraryError
 from scanfind.library import Model, ModelLibrary, ModelParameters, joint_table
+from scanfind.library.model import build_model, model_hash
+from scanfind.library.pairs import PairParameters, PairTable, key_count
+from scanfind.library.self_similar import Similar
+from scanfind.library.surface import SurfaceParameters
 from scanfind.mesh import Mesh, Placement
-from scanfind.model import build_model, model_hash
-from scanfind.pairs import PairParameters, PairTable, key_count
 from scanfind.pose import Pose
-from scanfind.self_similar import Similar
-from scanfind.surface import SurfaceParameters
 from scanfind.symmetry import Symmetry, parse_axes
 from test_surface import box, tube
 
@@ -387,7 +387,7 @@ SCRIPT = """
 import os, pickle, signal, sys
 from pathlib import Path
 from scanfind.library import ModelLibrary
-from scanfind.store import Store
+from scanfind.library.store import Store
 path, job, models = Path(sys.argv[1]), sys.argv[2], pickle.load(sys.stdin.buffer)
 if job == "die":
     insert = Store.insert

@@ -15,23 +15,23 @@ from numpy.typing import NDArray
 
 from scanfind.cloud import OrientedCloud, PointChunk
 from scanfind.find import find
-from scanfind.hypotheses import Hypotheses
+from scanfind.grid.moments import MomentGrid
+from scanfind.grid.scene import Scene, build_scene
+from scanfind.grid.surfels import number
 from scanfind.kernels.blocks import unpack_block
 from scanfind.kernels.lines import fit_lines, lines_of_samples
-from scanfind.lines import LEAST_CELLS, REACH, LineSearch, beside, frames, level_of
-from scanfind.model import Model, ModelParameters, build_model
-from scanfind.moments import MomentGrid
+from scanfind.library.model import Model, ModelParameters, build_model
+from scanfind.library.surface import SurfaceParameters
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.pose import Pose, random_rotation
-from scanfind.scene import Scene, build_scene
+from scanfind.search.hypotheses import Hypotheses
+from scanfind.search.lines import LEAST_CELLS, REACH, LineSearch, beside, frames, level_of
 from scanfind.simulate.instruments import Scanner
 from scanfind.simulate.objects import FRAME_SIZE_M, box_frame
 from scanfind.simulate.parts import blocks
 from scanfind.simulate.scanner import SimulatedScan, scan
 from scanfind.simulate.scene import Scene as SimulatedScene
 from scanfind.simulate.scene import SceneObject
-from scanfind.surface import SurfaceParameters
-from scanfind.surfels import number
 
 Floats = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import naive_distance as naive
 from scanfind.cloud import OrientedCloud
 from scanfind.errors import InvalidGeometryError
-from scanfind.near_surface import near_samples, near_triangles, signed_distances, weld
+from scanfind.library.near_surface import near_samples, near_triangles, signed_distances, weld
 from scanfind.pose import Pose
 
 Floats = NDArray[np.float64]

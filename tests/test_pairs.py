@@ -16,7 +16,7 @@ from scanfind.errors import InvalidGeometryError
 from scanfind.kernels.features import feature_key
 from scanfind.kernels.pair_pose import fit_pairs
 from scanfind.kernels.search import key_pairs
-from scanfind.pairs import PairParameters, build_pairs, key_count, rung_distance, rungs_of
+from scanfind.library.pairs import PairParameters, build_pairs, key_count, rung_distance, rungs_of
 from scanfind.pose import Pose, random_rotation
 
 Floats = NDArray[np.float64]

@@ -23,7 +23,7 @@ from benchmarks.paper.systems import Answer
 from benchmarks.paper.targets import paper, target
 
 from scanfind.errors import UnreadableFileError, UsageError
-from scanfind.near_surface import near_triangles, signed_distances
+from scanfind.library.near_surface import near_triangles, signed_distances
 from scanfind.pose import Pose
 from scanfind.scans import open_writer
 from scanfind.simulate.parts import box

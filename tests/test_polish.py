@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from scanfind.cloud import OrientedCloud
 from scanfind.detection import Detection, IsolatedPoints
-from scanfind.deviation import deviation_of
+from scanfind.fit.patches import followed, measured
+from scanfind.fit.polish import Polished, polish, polished
+from scanfind.fit.refine import RefineParameters
+from scanfind.isolation.deviation import deviation_of
 from scanfind.kernels.distance import NearSurface
+from scanfind.library.near_surface import near_samples, near_triangles, signed_distances
 from scanfind.mesh import Mesh
-from scanfind.near_surface import near_samples, near_triangles, signed_distances
-from scanfind.patches import followed, measured
-from scanfind.polish import Polished, polish, polished
 from scanfind.pose import Pose, random_rotation
-from scanfind.refine import RefineParameters
 from scanfind.simulate.parts import blocks, pipe
 from scanfind.simulate.placement import surface_points
 

@@ -34,8 +34,8 @@ from numpy.typing import NDArray
 
 from scanfind.detection import Detection
 from scanfind.errors import UsageError
-from scanfind.model import build_model
-from scanfind.near_surface import near_triangles, signed_distances
+from scanfind.library.model import build_model
+from scanfind.library.near_surface import near_triangles, signed_distances
 from scanfind.pose import Pose, rotation_from_vector
 from scanfind.simulate.parts import SIDES, blocks, box
 from scanfind.simulate.placement import surface_points

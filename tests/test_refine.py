@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 import naive
 from scanfind.cloud import PointChunk
 from scanfind.detection import Motion
-from scanfind.hypotheses import Hypotheses, ModelArrays, model_arrays
+from scanfind.fit.refine import Refined, covariance_of, icp, shrinking, unobservable
+from scanfind.grid.moments import MomentGrid
+from scanfind.grid.surfels import Surfels
 from scanfind.kernels.blocks import unpack_block
 from scanfind.kernels.nearest import mark_around, mark_rows, nearest_surfel
+from scanfind.library.model import Model, ModelParameters, build_model
+from scanfind.library.surface import SurfaceParameters
 from scanfind.mesh import Mesh
-from scanfind.model import Model, ModelParameters, build_model
-from scanfind.moments import MomentGrid
 from scanfind.pose import Pose, random_rotation
-from scanfind.refine import Refined, covariance_of, icp, shrinking, unobservable
+from scanfind.search.hypotheses import Hypotheses, ModelArrays, model_arrays
 from scanfind.simulate.parts import blocks, pipe
 from scanfind.simulate.placement import surface_points
-from scanfind.surface import SurfaceParameters
-from scanfind.surfels import Surfels
 
 Floats = NDArray[np.float64]
 

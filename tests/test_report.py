@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from by_hand import absent, detection, folder_by_hand, results
 from scanfind.cli import main
-from scanfind.elements import NOT_FOUND
+from scanfind.design.elements import NOT_FOUND
 from scanfind.errors import (
     MissingExtraError,
     OutputError,
@@ -176,11 +176,11 @@ def test_thinning_is_the_same_each_time() -> None:
 def test_a_model_of_very_many_faces_is_drawn_coarser_and_as_large() -> None:
     from dataclasses import replace
 
+    from scanfind.library.model import ModelParameters, build_model
+    from scanfind.library.surface import SurfaceParameters
     from scanfind.mesh import Mesh
-    from scanfind.model import ModelParameters, build_model
     from scanfind.report.material import MOST_FACES
     from scanfind.simulate.parts import box
-    from scanfind.surface import SurfaceParameters
 
     side = np.linspace(0.0, 1.0, 200)
     x, y = np.meshgrid(side, side)

@@ -13,14 +13,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scanfind import schema
 from scanfind.detection import Detection, Deviation, Findings, IsolatedPoints, Motion, Refused, SceneScan
-from scanfind.document import document, findings_of, fingerprint, model_entries
 from scanfind.errors import OutputError, UnreadableFileError, UnsupportedFormatError
 from scanfind.library import ModelLibrary
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose, random_rotation
-from scanfind.results import NAME_BYTES, read_results, result_folder, safe_name, write_results
+from scanfind.results import NAME_BYTES, read_results, result_folder, safe_name, schema, write_results
+from scanfind.results.document import document, findings_of, fingerprint, model_entries
 from scanfind.scans import read_scan
 
 # The schema of results.json that other programs were promised; more keys may come, none of these may go.

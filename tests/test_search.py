@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from scanfind.cloud import PointChunk
-from scanfind.draws import bin_pool, wald_table
+from scanfind.grid.moments import MomentGrid
+from scanfind.grid.scene import orientation_grid
+from scanfind.grid.surfels import Surfels
 from scanfind.kernels.blocks import find_block, pack_block
 from scanfind.kernels.search import draw_firsts, draw_seconds, normal_bit
-from scanfind.moments import MomentGrid
-from scanfind.scene import orientation_grid
-from scanfind.self_similar import cube_turns
-from scanfind.surfels import Surfels
+from scanfind.library.self_similar import cube_turns
+from scanfind.search.draws import bin_pool, wald_table
 from scanfind.threads import in_threads
 
 Floats = NDArray[np.float64]

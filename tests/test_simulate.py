@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from naive_simulate import distances_to, first_hit
 from scanfind.errors import InvalidGeometryError, UsageError
+from scanfind.evidence.rays import RayCaster
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose, random_rotation
-from scanfind.rays import RayCaster
 from scanfind.simulate import parts
 from scanfind.simulate.objects import (
     CLEARLY_DIFFERENT_M,

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 import naive_surface as naive
 from scanfind.errors import InvalidGeometryError, UsageError
 from scanfind.kernels.sampling import largest_distance, poisson_order
+from scanfind.library.surface import SHRINK, ModelSurface, SurfaceParameters, fibonacci_sphere, sample_mesh
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose, random_rotation
-from scanfind.surface import SHRINK, ModelSurface, SurfaceParameters, fibonacci_sphere, sample_mesh
 
 Floats = NDArray[np.float64]
 

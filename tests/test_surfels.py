@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 import naive
 from scanfind.cloud import PointChunk, PointCloud
+from scanfind.grid.moments import MomentGrid, empty_hash
+from scanfind.grid.scene import GridParameters, Scene, build_scene
+from scanfind.grid.surfels import Surfels
 from scanfind.kernels.blocks import BIAS, fill_hash, find_block, pack_block, unpack_block
 from scanfind.kernels.surfels import smallest_eigenvector
-from scanfind.moments import MomentGrid, empty_hash
-from scanfind.scene import GridParameters, Scene, build_scene
-from scanfind.sources import Sources
-from scanfind.surfels import Surfels
+from scanfind.scans.sources import Sources
 
 Floats = NDArray[np.float64]
 
@@ -129,8 +129,8 @@ def test_arrays_grow_without_a_trace(monkeypatch: pytest.MonkeyPatch, jobs: int)
     # Far more blocks and cells than there is room for at first, in one chunk and in many.
     points = np.random.default_rng(0).uniform(-12, 12, (100_000, 3))
     roomy = grid_of([chunk(points)], 0.1)
-    monkeypatch.setattr("scanfind.moments.EMPTY_BLOCKS", 1 << 10)
-    monkeypatch.setattr("scanfind.moments.EMPTY_ROWS", 1 << 14)
+    monkeypatch.setattr("scanfind.grid.moments.EMPTY_BLOCKS", 1 << 10)
+    monkeypatch.setattr("scanfind.grid.moments.EMPTY_ROWS", 1 << 14)
     whole = grid_of([chunk(points)], 0.1, jobs=jobs)
     assert len(whole.block_keys) > 1 << 10
     assert len(whole.moments) > 1 << 14

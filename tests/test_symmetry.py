@@ -11,18 +11,18 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from scanfind.cloud import CloudModel
-from scanfind.cloud_surface import sample_cloud
 from scanfind.errors import UsageError
+from scanfind.library.cloud_surface import sample_cloud
+from scanfind.library.model import ModelParameters, build_model
+from scanfind.library.onto_itself import OntoItself
+from scanfind.library.self_similar import LEAST_OVERLAP, Similar, find_similar
+from scanfind.library.surface import SurfaceParameters, sample_mesh
+from scanfind.library.symmetries import declared_symmetry, find_symmetry
 from scanfind.mesh import Mesh
-from scanfind.model import ModelParameters, build_model
-from scanfind.onto_itself import OntoItself
 from scanfind.pose import Pose, random_rotation
-from scanfind.self_similar import LEAST_OVERLAP, Similar, find_similar
 from scanfind.simulate.objects import box_frame
 from scanfind.simulate.parts import blocks, box, cylinder, flange, pipe, revolve, tee
 from scanfind.simulate.placement import surface_points
-from scanfind.surface import SurfaceParameters, sample_mesh
-from scanfind.symmetries import declared_symmetry, find_symmetry
 from scanfind.symmetry import Symmetry, parse_axes, pose_error
 
 Floats = NDArray[np.float64]

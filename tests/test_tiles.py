@@ -15,14 +15,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import scanfind.sources
+import scanfind.scans.sources
 from scanfind.cloud import CHUNK_POINTS, PointChunk, PointCloud
 from scanfind.detection import Findings
 from scanfind.errors import UnreadableFileError, UsageError
 from scanfind.find import find
-from scanfind.moments import ROW, MomentGrid
+from scanfind.grid.moments import ROW, MomentGrid
 from scanfind.scans import open_writer, read_scan, scan_info
-from scanfind.sources import scans_of
+from scanfind.scans.sources import scans_of
 from scanfind.tiles import find_in_tiles
 from scanfind.tiles import plan as planned
 from scanfind.tiles.plan import BASE_BYTES, ROW_BYTES, STATION_BYTES, Held, estimate, size_of, tiles_of
@@ -126,7 +126,7 @@ def test_threads_do_the_same(narrow: int) -> None:
 
 
 def test_a_memory_that_cannot_be_kept_is_refused_before_a_point_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scanfind.sources.chunks_of", lambda cloud: pytest.fail("it was read"))
+    monkeypatch.setattr("scanfind.scans.sources.chunks_of", lambda cloud: pytest.fail("it was read"))
     with pytest.raises(UsageError, match=r"--memory 500 MB cannot be kept: the smallest tile .* needs about"):
         in_tiles(500_000_000)
 
@@ -200,12 +200,12 @@ FIRST_BEYOND = 2**32 + 7
 
 
 def test_points_beyond_the_32nd_bit_keep_their_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    read = scanfind.sources.chunks_of
+    read = scanfind.scans.sources.chunks_of
 
     def far_on(cloud: PointCloud) -> Iterator[PointChunk]:
         return (replace(chunk, source_index=chunk.source_index + FIRST_BEYOND) for chunk in read(cloud))
 
-    monkeypatch.setattr("scanfind.sources.chunks_of", far_on)
+    monkeypatch.setattr("scanfind.scans.sources.chunks_of", far_on)
     (found,) = find_in_tiles(clouds(), library(), parameters=QUICK)
     assert found.isolated is not None
     cloud, where = clouds()[0], found.isolated.scan_id == 0

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from by_hand import absent, at, detection, element, motion, part, results
-from scanfind.elements import INSTALLED, NO_DATA, NOT_ENOUGH_DATA, NOT_FOUND, OCCLUDED, UNCERTAIN
+from scanfind.design.elements import INSTALLED, NO_DATA, NOT_ENOUGH_DATA, NOT_FOUND, OCCLUDED, UNCERTAIN
 from scanfind.errors import UsageError
 from scanfind.pose import random_rotation
-from scanfind.schema import AxisEntry, DetectionEntry, ElementEntry, ModelEntry, SymmetryEntry
+from scanfind.results.schema import AxisEntry, DetectionEntry, ElementEntry, ModelEntry, SymmetryEntry
 from scanfind.simulate.parts import cylinder
 from scanfind.tolerances import (
     IN,

@@ -14,21 +14,21 @@ from numpy.typing import NDArray
 
 import naive
 from scanfind.cloud import CloudModel, PointChunk
-from scanfind.depth import LEAST_SPOKEN, Beams, DepthMap, joined_until_spoken
-from scanfind.free_space import Limits, caster_of, spoken_of
-from scanfind.hypotheses import Hypotheses, model_arrays
+from scanfind.evidence.free_space import Limits, caster_of, spoken_of
+from scanfind.evidence.verify import distinct, gather_support, spread
+from scanfind.fit.refine import Refined
+from scanfind.grid.depth import LEAST_SPOKEN, Beams, DepthMap, joined_until_spoken
+from scanfind.grid.moments import MomentGrid
+from scanfind.grid.scene import GridParameters, Scene, build_scene
 from scanfind.kernels.grid import AIM_UNITS, NO_BEAM, RANGE_UNITS, cube_pixel, cube_place, pack_beam, unpack_beam
 from scanfind.library import joint_table
-from scanfind.model import Model, ModelParameters, build_model
-from scanfind.moments import MomentGrid
+from scanfind.library.model import Model, ModelParameters, build_model
+from scanfind.library.surface import SurfaceParameters
 from scanfind.parameters import PRESETS
 from scanfind.pose import Pose, random_rotation
-from scanfind.recognise import Candidate, Recognition
-from scanfind.refine import Refined
-from scanfind.scene import GridParameters, Scene, build_scene
+from scanfind.recognition.recognise import Candidate, Recognition
+from scanfind.search.hypotheses import Hypotheses, model_arrays
 from scanfind.simulate.parts import blocks
-from scanfind.surface import SurfaceParameters
-from scanfind.verify import distinct, gather_support, spread
 
 Floats = NDArray[np.float64]
 
@@ -211,7 +211,7 @@ def test_of_more_beams_than_needed_a_share_says_the_same(monkeypatch: pytest.Mon
     placed, limits = Pose(np.eye(3), np.array([2.1, 0.15, 0.1])), Limits(0.01, 0.05, 0.25)
     beams = [beams_about(np.zeros(3), points_seen())]
     every = spoken_of(box(), caster_of(box()), placed, beams, limits)
-    monkeypatch.setattr("scanfind.free_space.MOST_BEAMS", 500)
+    monkeypatch.setattr("scanfind.evidence.free_space.MOST_BEAMS", 500)
     some = spoken_of(box(), caster_of(box()), placed, beams, limits)
     assert some != every
     np.testing.assert_allclose(some, every, rtol=0, atol=0.1 * sum(every))

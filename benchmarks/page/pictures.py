@@ -12,8 +12,8 @@ from benchmarks.common import Floats
 from benchmarks.paper.experiments import Case, cases
 from benchmarks.paper.systems import OURS, Answer, scanfind_with
 from benchmarks.paper.targets import target
+from scanfind.library.surface import SurfaceParameters, sample_mesh
 from scanfind.pose import Pose
-from scanfind.surface import SurfaceParameters, sample_mesh
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

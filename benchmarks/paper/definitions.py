@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from benchmarks.common import Floats, PoseError
 from scanfind.cloud import CloudModel
-from scanfind.cloud_surface import sample_cloud
+from scanfind.library.cloud_surface import sample_cloud
+from scanfind.library.near_surface import near_triangles, signed_distances
+from scanfind.library.surface import SurfaceParameters, sample_mesh
 from scanfind.mesh import Mesh
-from scanfind.near_surface import near_triangles, signed_distances
 from scanfind.pose import Pose
-from scanfind.surface import SurfaceParameters, sample_mesh
 
 if TYPE_CHECKING:
     from scanfind.kernels.distance import NearSurface

@@ -11,7 +11,7 @@ from benchmarks.common import Floats
 from benchmarks.paper.targets import Target
 from scanfind.cloud import PointCloud
 from scanfind.errors import UsageError
-from scanfind.near_surface import near_triangles, signed_distances
+from scanfind.library.near_surface import near_triangles, signed_distances
 from scanfind.pose import Pose
 from scanfind.simulate import furniture
 from scanfind.simulate.layout import Layout

@@ -17,9 +17,9 @@ from scanfind.cloud import CloudModel
 from scanfind.errors import UsageError
 from scanfind.find import find
 from scanfind.library import ModelLibrary
+from scanfind.library.model import ModelParameters
+from scanfind.library.near_surface import near_model, signed_distances
 from scanfind.mesh import Mesh
-from scanfind.model import ModelParameters
-from scanfind.near_surface import near_model, signed_distances
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.pose import Pose
 from scanfind.simulate.objects import pipe_spool

@@ -14,10 +14,10 @@ from benchmarks.recognition.trial import Instance, Row, Trial, right_deg
 from benchmarks.recognition.why import Ideal, ideal, weighed
 from scanfind.detection import Detection, Findings
 from scanfind.find import find
-from scanfind.near_surface import near_triangles, signed_distances
+from scanfind.library.near_surface import near_triangles, signed_distances
+from scanfind.library.self_similar import cube_turns
 from scanfind.parameters import PRESETS
 from scanfind.pose import Pose
-from scanfind.self_similar import cube_turns
 
 NAN = float("nan")
 # The default but for its time limit of 60 s: what is found should not hang on how busy the machine is.

@@ -10,8 +10,8 @@ import numpy as np
 
 from benchmarks.common import PoseError, centre_of, pose_error
 from scanfind.library import ModelLibrary
+from scanfind.library.model import Model, build_model
 from scanfind.mesh import Mesh
-from scanfind.model import Model, build_model
 from scanfind.pose import Pose
 from scanfind.simulate.equipment import FLANGE_OVER_PIPE, TOWARDS_X, flange_thickness, valve
 from scanfind.simulate.objects import Route, SpoolDesign, box_frame, pipe_spool, spool

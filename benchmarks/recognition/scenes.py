@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from benchmarks.common import Floats, centre_of
 from benchmarks.recognition.parts import Part
+from scanfind.evidence.rays import RayCaster
 from scanfind.pose import Pose, random_rotation
-from scanfind.rays import RayCaster
 from scanfind.simulate.parts import blocks
 from scanfind.simulate.placement import surface_points
 from scanfind.simulate.scanner import shares

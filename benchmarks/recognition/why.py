@@ -9,17 +9,17 @@ import numpy as np
 
 from benchmarks.recognition.parts import Part, library_of
 from benchmarks.recognition.trial import Trial
-from scanfind.hypotheses import Hypotheses
+from scanfind.evidence.verify import distances, outlines, why_refused
+from scanfind.grid.moments import MomentGrid
+from scanfind.grid.scene import build_scene, first_cell
 from scanfind.library import joint_table
-from scanfind.model import Model
-from scanfind.moments import MomentGrid
+from scanfind.library.model import Model
 from scanfind.parameters import PRESETS
 from scanfind.pose import Pose
-from scanfind.recognise import Recognition
-from scanfind.scene import build_scene, first_cell
-from scanfind.sources import Sources
+from scanfind.recognition.recognise import Recognition
+from scanfind.scans.sources import Sources
+from scanfind.search.hypotheses import Hypotheses
 from scanfind.threads import available_cores
-from scanfind.verify import distances, outlines, why_refused
 
 # A beam that ends so near to a sample speaks for it; one that goes on so far behind it has passed through it.
 ON_M, THROUGH_M = 0.015, 0.03

@@ -18,8 +18,8 @@ from benchmarks.rivals.answer import TIME_LIMIT, Answer, read_answer
 from benchmarks.rivals.table import ENVIRONMENTS, RIVALS, ROOT
 from scanfind.cloud import as_points
 from scanfind.errors import InvalidGeometryError, UsageError
+from scanfind.library.surface import ModelSurface, SurfaceParameters, sample_mesh
 from scanfind.mesh import Mesh
-from scanfind.surface import ModelSurface, SurfaceParameters, sample_mesh
 
 Floats = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from scanfind.errors import ScanfindError
     from scanfind.find import find
     from scanfind.inspect import inspect
-    from scanfind.isolate import isolate
+    from scanfind.isolation.isolate import isolate
     from scanfind.library import ModelLibrary
     from scanfind.mesh import Mesh
     from scanfind.models import read_models
@@ -70,7 +70,7 @@ _HOME = {
     "find": "find",
     "find_in_tiles": "tiles",
     "inspect": "inspect",
-    "isolate": "isolate",
+    "isolate": "isolation.isolate",
     "ModelLibrary": "library",
     "Mesh": "mesh",
     "read_models": "models",

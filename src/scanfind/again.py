@@ -8,15 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scanfind import schema
 from scanfind.clock import Clock, say_if_compiling, watched
 from scanfind.detection import Findings
-from scanfind.document import findings_of
 from scanfind.errors import UsageError
 from scanfind.find import surfaces_of, with_points
 from scanfind.library import ModelLibrary
-from scanfind.results import MODELS, fill_folder, open_remainder, read_results, result_folder
-from scanfind.sources import Sources
+from scanfind.results import MODELS, fill_folder, open_remainder, read_results, result_folder, schema
+from scanfind.results.document import findings_of
+from scanfind.scans.sources import Sources
 from scanfind.threads import available_cores
 
 if TYPE_CHECKING:

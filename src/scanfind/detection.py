@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scanfind.pose import Pose
 
 if TYPE_CHECKING:
-    from scanfind.alignment import Alignment
-    from scanfind.elements import Element
+    from scanfind.design.alignment import Alignment
+    from scanfind.design.elements import Element
 
 Floats = NDArray[np.float64]
 

@@ -14,31 +14,31 @@ from scanfind.assembly import REACH_M
 from scanfind.clock import Clock, say_if_compiling, watched
 from scanfind.cloud import CloudModel, PointChunk
 from scanfind.detection import Findings
-from scanfind.deviation import deviation_of
 from scanfind.errors import UsageError, require
-from scanfind.isolate import IsolateParameters, Placed
-from scanfind.isolate import isolate as isolate_raw
+from scanfind.fit.polish import polished
+from scanfind.grid.moments import MomentGrid
+from scanfind.grid.scene import build_scene
+from scanfind.isolation.deviation import deviation_of
+from scanfind.isolation.isolate import IsolateParameters, Placed
+from scanfind.isolation.isolate import isolate as isolate_raw
 from scanfind.library import ModelLibrary, joint_table
+from scanfind.library.model import Model, ModelParameters
+from scanfind.library.near_surface import near_model, near_triangles
 from scanfind.mesh import Mesh
-from scanfind.model import Model, ModelParameters
-from scanfind.moments import MomentGrid
-from scanfind.near_surface import near_model, near_triangles
 from scanfind.parameters import PRESETS, IsolationParameters, Parameters
-from scanfind.polish import polished
 from scanfind.pose import Pose
-from scanfind.recognise import Recognition
-from scanfind.scene import build_scene
-from scanfind.sizes import Sizes
-from scanfind.sources import Scan, Sources, require_points
+from scanfind.recognition.recognise import Recognition
+from scanfind.recognition.sizes import Sizes
+from scanfind.scans.sources import Scan, Sources, require_points
 from scanfind.threads import available_cores
 
 if TYPE_CHECKING:
     from scanfind.detection import Detection
     from scanfind.kernels.distance import NearSurface
     from scanfind.progress import Progress
-    from scanfind.recognise import Standing
+    from scanfind.recognition.recognise import Standing
+    from scanfind.recognition.sizes import Size
     from scanfind.scans import CloudWriter
-    from scanfind.sizes import Size
 
 Floats: TypeAlias = NDArray[np.float64]
 ModelInput: TypeAlias = "ModelLibrary | Mesh | CloudModel | str | PathLike[str]"

@@ -6,26 +6,26 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
-from scanfind.alignment import CELL_M, fitted, lies_at
-from scanfind.elements import INSTALLED, installed, placements_of
+from scanfind.design.alignment import CELL_M, fitted, lies_at
+from scanfind.design.elements import INSTALLED, installed, placements_of
+from scanfind.design.thinned import Thinned
 from scanfind.errors import AlignmentError
+from scanfind.evidence.free_space import Spoken
 from scanfind.find import find, models_of
-from scanfind.free_space import Spoken
 from scanfind.library import ModelLibrary
 from scanfind.parameters import PRESETS, Parameters
-from scanfind.sources import Sources
-from scanfind.thinned import Thinned
+from scanfind.scans.sources import Sources
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from scanfind.design.elements import Element
     from scanfind.detection import Findings
-    from scanfind.elements import Element
     from scanfind.find import ModelInput
-    from scanfind.model import Model
+    from scanfind.library.model import Model
     from scanfind.pose import Pose
     from scanfind.progress import Progress
-    from scanfind.sources import Scan
+    from scanfind.scans.sources import Scan
 
 
 def inspect(

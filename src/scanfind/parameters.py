@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 
 from scanfind.assembly.parameters import AssemblyParameters
 from scanfind.errors import require
-from scanfind.pairs import PairParameters
-from scanfind.refine import RefineParameters
-from scanfind.scene import GridParameters
-from scanfind.search import SearchParameters
-from scanfind.surface import SurfaceParameters
-from scanfind.verify import VerifyParameters
+from scanfind.evidence.verify import VerifyParameters
+from scanfind.fit.refine import RefineParameters
+from scanfind.grid.scene import GridParameters
+from scanfind.library.pairs import PairParameters
+from scanfind.library.surface import SurfaceParameters
+from scanfind.search.surface import SearchParameters
 
 
 @dataclass(frozen=True)

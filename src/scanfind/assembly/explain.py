@@ -27,15 +27,15 @@ from scanfind.assembly.parts import Assembly, assembly_of
 from scanfind.assembly.points import fitted_to_points, placed_faces
 from scanfind.cloud import OrientedCloud
 from scanfind.detection import PartFit
-from scanfind.free_space import Limits, caster_of, spoken_of
+from scanfind.evidence.free_space import Limits, caster_of, spoken_of
+from scanfind.evidence.verify import Evidence, gather_support, why_refused
+from scanfind.fit.refine import motion_of, triple
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose, nearest_rotation, rotation_from_vector, rotation_vector
-from scanfind.refine import motion_of, triple
-from scanfind.verify import Evidence, gather_support, why_refused
 
 if TYPE_CHECKING:
     from scanfind.assembly.parameters import AssemblyParameters
-    from scanfind.model import Model
+    from scanfind.library.model import Model
 
 Floats = NDArray[np.float64]
 

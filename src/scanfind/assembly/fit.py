@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.hypotheses import Hypotheses
+from scanfind.evidence.verify import Level, held_against, spread
 from scanfind.pose import Pose, nearest_rotation, rotation_from_vector, rotation_vector
-from scanfind.verify import Level, held_against, spread
+from scanfind.search.hypotheses import Hypotheses
 
 if TYPE_CHECKING:
     from scanfind.assembly.parameters import AssemblyParameters
     from scanfind.assembly.parts import Assembly, Joint
-    from scanfind.hypotheses import ModelArrays
-    from scanfind.scene import Scene
-    from scanfind.verify import VerifyParameters
+    from scanfind.evidence.verify import VerifyParameters
+    from scanfind.grid.scene import Scene
+    from scanfind.search.hypotheses import ModelArrays
 
 Floats = NDArray[np.float64]
 

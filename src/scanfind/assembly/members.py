@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.library.near_surface import unit_normals, weld
 from scanfind.mesh import Mesh, doubled_areas
-from scanfind.near_surface import unit_normals, weld
 
 Floats = NDArray[np.float64]
 Labels = NDArray[np.int64]

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.assembly.members import Labels, connected, members
-from scanfind.hypotheses import ModelArrays
+from scanfind.library.near_surface import near_triangles, signed_distances, weld
+from scanfind.library.surface import SurfaceParameters, random_points, sample_mesh
 from scanfind.mesh import Mesh
-from scanfind.near_surface import near_triangles, signed_distances, weld
-from scanfind.surface import SurfaceParameters, random_points, sample_mesh
+from scanfind.search.hypotheses import ModelArrays
 
 Floats = NDArray[np.float64]
 

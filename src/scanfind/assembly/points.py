@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.assembly.fit import Matches, PlacedParts, hinges_of, stepped, tukey
-from scanfind.near_surface import near_triangles, signed_distances
+from scanfind.library.near_surface import near_triangles, signed_distances
 
 if TYPE_CHECKING:
     from scanfind.assembly.parts import Assembly

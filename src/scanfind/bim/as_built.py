@@ -19,7 +19,7 @@ from scanfind.pose import Pose
 from scanfind.results import result_file
 
 if TYPE_CHECKING:
-    from scanfind.schema import DetectionEntry, ElementEntry, Results
+    from scanfind.results.schema import DetectionEntry, ElementEntry, Results
 
 Floats = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from scanfind.bim.views import FIELD_OF_VIEW, Camera, Colour, Shown, Views
 from scanfind.bim.wording import description, inspected, is_finding, title
-from scanfind.elements import INSTALLED, NO_DATA, NOT_ENOUGH_DATA, NOT_FOUND, OCCLUDED, UNCERTAIN
+from scanfind.design.elements import INSTALLED, NO_DATA, NOT_ENOUGH_DATA, NOT_FOUND, OCCLUDED, UNCERTAIN
 from scanfind.errors import UsageError
 from scanfind.library import ModelLibrary
 from scanfind.picture import png
@@ -28,7 +28,7 @@ from scanfind.results import MODELS, RESULTS_JSON, result_file
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from scanfind.schema import ElementEntry, Results
+    from scanfind.results.schema import ElementEntry, Results
 
 # Red is missing, orange stands wrong, the others are open questions; told apart by colour-blind people, too.
 COLOURS: dict[str, Colour] = {

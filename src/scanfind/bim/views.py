@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.evidence.rays import RayCaster
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose
-from scanfind.rays import RayCaster
 
 Floats = NDArray[np.float64]
 Colour = tuple[int, int, int]

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scanfind.document import rows
-from scanfind.elements import INSTALLED, OUT_OF_TOLERANCE
+from scanfind.design.elements import INSTALLED, OUT_OF_TOLERANCE
 from scanfind.errors import UsageError
-from scanfind.explain import element_sentences, headline
 from scanfind.pose import Pose
 from scanfind.results import MODELS, read_results
+from scanfind.results.document import rows
+from scanfind.results.explain import element_sentences, headline
 
 if TYPE_CHECKING:
-    from scanfind.schema import ElementEntry, Results
+    from scanfind.results.schema import ElementEntry, Results
 
 
 def inspected(result_dir: str | Path, tolerance: str | Path | None = None) -> tuple[Results, dict[int, str]]:

@@ -13,7 +13,7 @@ from scanfind.cli.outputs import NOT_AS_WANTED, SCANS_MISSING, results_of
 from scanfind.errors import UsageError
 
 if TYPE_CHECKING:
-    from scanfind.schema import Results
+    from scanfind.results.schema import Results
 
 
 def find(
@@ -123,7 +123,7 @@ def find(
     from scanfind.parameters import PRESETS
     from scanfind.progress import progress_on
     from scanfind.results import open_remainder, result_folder
-    from scanfind.sources import files_of
+    from scanfind.scans.sources import files_of
 
     flags = {
         "preset": preset, "seed": seed, "jobs": jobs, "units": units, "origin": origin, "format": format,

@@ -31,8 +31,8 @@ def add_models(
     models: ModelLibrary, files: Sequence[Path], run: Run, parameters: Parameters, symmetry: str | None = None
 ) -> list[str]:
     """Prepare every model of the files and keep it in the library; their names. `symmetry`: see ModelParameters."""
+    from scanfind.library.model import ModelParameters
     from scanfind.mesh import Mesh
-    from scanfind.model import ModelParameters
     from scanfind.models import STATES_UNITS, read_models
 
     prepared = ModelParameters(surface=parameters.surface, pairs=parameters.pairs, symmetry=symmetry)

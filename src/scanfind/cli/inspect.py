@@ -13,7 +13,7 @@ from scanfind.cli.outputs import NOT_AS_WANTED, results_of
 from scanfind.errors import UsageError
 
 if TYPE_CHECKING:
-    from scanfind.schema import Results
+    from scanfind.results.schema import Results
 
 
 def inspect(
@@ -137,7 +137,7 @@ def report(results: Results, out: Path | None, *, json: bool) -> None:
 
 def failed(results: Results, on: str) -> bool:
     """Is some element not found or, where that is asked, out of tolerance?"""
-    from scanfind.elements import NOT_FOUND, OUT_OF_TOLERANCE
+    from scanfind.design.elements import NOT_FOUND, OUT_OF_TOLERANCE
 
     bad = {"not-found": {NOT_FOUND}, "out-of-tolerance": {NOT_FOUND, OUT_OF_TOLERANCE}}[on]
     return any(each.status in bad or each.verdict in bad for each in results.elements)

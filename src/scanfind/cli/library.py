@@ -159,7 +159,7 @@ def remove(lib: Path, name: str, /) -> None:
 
 
 def _fields(summary: ModelSummary) -> dict[str, object]:
-    from scanfind.document import symmetry_entry
+    from scanfind.results.document import symmetry_entry
 
     return {**summary._asdict(), "symmetry": symmetry_entry(summary.symmetry).model_dump()}
 

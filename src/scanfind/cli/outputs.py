@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from scanfind.library import ModelLibrary
     from scanfind.parameters import Parameters
     from scanfind.progress import Progress
-    from scanfind.schema import Results
+    from scanfind.results.schema import Results
 
 NOT_AS_WANTED = 3  # the exit code of --fail-on
 SCANS_MISSING = 4  # of a search in tiles that could not read some of many scans
@@ -22,8 +22,8 @@ def results_of(
     progress: Progress | None, remainder: str | None = None,
 ) -> Results:  # fmt: skip
     """What results.json holds; into a staged result folder with all that belongs to it, where there is one."""
-    from scanfind.document import document, model_entries
     from scanfind.results import fill_folder
+    from scanfind.results.document import document, model_entries
 
     if folder is None:
         return document(findings, models=model_entries(models), parameters=parameters, seed=run.seed)

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from math import atan2, degrees, hypot
 from typing import TYPE_CHECKING
 
-from scanfind.detection import OFF_M
-from scanfind.elements import (
+from scanfind.design.elements import (
     IN_TOLERANCE,
     INSTALLED,
     NO_DATA,
@@ -18,9 +17,18 @@ from scanfind.elements import (
     OUT_OF_TOLERANCE,
     UNCERTAIN,
 )
+from scanfind.detection import OFF_M
 
 if TYPE_CHECKING:
-    from scanfind.schema import AlignmentEntry, DetectionEntry, ElementEntry, Matrix, PartEntry, RefusedEntry, Results
+    from scanfind.results.schema import (
+        AlignmentEntry,
+        DetectionEntry,
+        ElementEntry,
+        Matrix,
+        PartEntry,
+        RefusedEntry,
+        Results,
+    )
     from scanfind.simulate import Sight
 
 FOUND = (

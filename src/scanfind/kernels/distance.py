@@ -25,7 +25,7 @@ FACE, EDGE, CORNER = 0, 1, 4  # FACE; EDGE + 0, 1, 2: ab, bc, ca; CORNER + 0, 1,
 
 
 class NearSurface(NamedTuple):
-    """A surface that can be asked how far points are, and on which side; built by `scanfind.near_surface`.
+    """A surface that can be asked how far points are, and on which side; built by `scanfind.library.near_surface`.
 
     A tree of boxes, not voxels with lists: it costs 200 bytes a triangle whatever the reach, where lists for triangles
     of 3 mm and a reach of 1 cm would hold 400 entries a voxel.

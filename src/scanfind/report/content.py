@@ -11,7 +11,7 @@ from scanfind.report.items import Item, counts_of
 
 if TYPE_CHECKING:
     from scanfind.report.material import Material
-    from scanfind.schema import Results
+    from scanfind.results.schema import Results
     from scanfind.tolerances import Profile
 
 

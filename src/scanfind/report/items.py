@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from math import degrees
 from typing import TYPE_CHECKING
 
-from scanfind.elements import INSTALLED, NO_DATA, NOT_ENOUGH_DATA, NOT_FOUND, OCCLUDED, UNCERTAIN
-from scanfind.explain import STATUS_WORDS, detection_sentences, element_sentences, headline
+from scanfind.design.elements import INSTALLED, NO_DATA, NOT_ENOUGH_DATA, NOT_FOUND, OCCLUDED, UNCERTAIN
+from scanfind.results.explain import STATUS_WORDS, detection_sentences, element_sentences, headline
 from scanfind.tolerances import IN, NOT_JUDGED, OUT, Judgement, judge_detection, judge_element
 
 if TYPE_CHECKING:
-    from scanfind.schema import DetectionEntry, ElementEntry, Matrix, Results
+    from scanfind.results.schema import DetectionEntry, ElementEntry, Matrix, Results
     from scanfind.tolerances import Profile
     from scanfind.tolerances.discs import Disc
 

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.document import fingerprint
 from scanfind.library import ModelLibrary
 from scanfind.results import MODELS
+from scanfind.results.document import fingerprint
 from scanfind.scans import read_scan
 
 if TYPE_CHECKING:
     from scanfind.cloud import PointChunk
-    from scanfind.model import Model
-    from scanfind.schema import Matrix, Results
+    from scanfind.library.model import Model
+    from scanfind.results.schema import Matrix, Results
 
 Floats = NDArray[np.float64]
 

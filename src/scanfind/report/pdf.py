@@ -9,7 +9,7 @@ from itertools import pairwise
 from math import degrees
 from typing import TYPE_CHECKING, Any
 
-from scanfind.elements import INSTALLED
+from scanfind.design.elements import INSTALLED
 from scanfind.errors import MissingExtraError
 from scanfind.picture import SCALE, png
 from scanfind.report.pictures import picture_of

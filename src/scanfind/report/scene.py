@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from scanfind.report.items import Item
     from scanfind.report.material import Material, Points
-    from scanfind.schema import Matrix
+    from scanfind.results.schema import Matrix
 
 Floats = NDArray[np.float64]
 

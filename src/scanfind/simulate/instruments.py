@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scanfind.errors import UsageError
+from scanfind.evidence.rays import RayCaster
 from scanfind.pose import Pose
-from scanfind.rays import RayCaster
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

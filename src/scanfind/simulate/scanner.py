@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from scanfind.cloud import PointCloud, as_points
 from scanfind.errors import UsageError
+from scanfind.evidence.rays import RayCaster
 from scanfind.pose import Pose
-from scanfind.rays import RayCaster
 from scanfind.simulate.instruments import Instrument, Scanner
 from scanfind.simulate.scene import BACKGROUND, Scene
 

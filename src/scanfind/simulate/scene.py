@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.evidence.rays import RayCaster
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose
-from scanfind.rays import RayCaster
 from scanfind.simulate.placement import surface_points
 
 Floats = NDArray[np.float64]

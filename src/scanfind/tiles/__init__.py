@@ -30,15 +30,15 @@ from pydantic_core import to_jsonable_python
 from scanfind.clock import Clock, say_if_compiling
 from scanfind.cloud import shift_for
 from scanfind.detection import Findings
-from scanfind.deviation import deviation_of
-from scanfind.document import fingerprint
 from scanfind.errors import Interrupted, UnreadableFileError, UnsupportedFormatError, UsageError
 from scanfind.find import ModelInput, isolation_tolerance, models_of
-from scanfind.moments import MomentGrid
+from scanfind.fit.polish import polished
+from scanfind.grid.moments import MomentGrid
+from scanfind.isolation.deviation import deviation_of
 from scanfind.parameters import PRESETS, Parameters
-from scanfind.polish import polished
-from scanfind.sizes import Sizes
-from scanfind.sources import Scan
+from scanfind.recognition.sizes import Sizes
+from scanfind.results.document import fingerprint
+from scanfind.scans.sources import Scan
 from scanfind.threads import available_cores
 from scanfind.tiles.listed import Listed, listed_of
 from scanfind.tiles.plan import (
@@ -71,7 +71,7 @@ from scanfind.tiles.work import Crew, Here, Workers, all_done, no_room, opened
 
 if TYPE_CHECKING:
     from scanfind.detection import Detection, Refused
-    from scanfind.model import Model
+    from scanfind.library.model import Model
     from scanfind.progress import Progress
 
 __all__ = ["find_in_tiles"]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from scanfind.cloud import PointCloud, ScanInfo, Station
 from scanfind.errors import UnreadableFileError, UnsupportedFormatError
-from scanfind.sources import Scan, Source, origin_of, scans_of, source_of
+from scanfind.scans.sources import Scan, Source, origin_of, scans_of, source_of
 
 
 class One(NamedTuple):

@@ -17,7 +17,7 @@ from scanfind.errors import UsageError
 
 if TYPE_CHECKING:
     from scanfind.cloud import ScanInfo
-    from scanfind.model import Model
+    from scanfind.library.model import Model
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

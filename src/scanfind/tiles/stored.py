@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.depth import DEPTH_PIXELS, Beams
-from scanfind.moments import ROW, MomentGrid
+from scanfind.grid.depth import DEPTH_PIXELS, Beams
+from scanfind.grid.moments import ROW, MomentGrid
 from scanfind.tiles.plan import Tile
 
 Floats = NDArray[np.float64]

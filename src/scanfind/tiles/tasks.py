@@ -17,21 +17,21 @@ from scanfind.clock import Clock
 from scanfind.detection import Detection, IsolatedPoints, Refused, SceneScan
 from scanfind.errors import InvalidGeometryError, UnreadableFileError, UnsupportedFormatError
 from scanfind.find import recognise
-from scanfind.isolate import IsolateParameters, Isolator, Placed, joined, pieces_of
-from scanfind.moments import MomentGrid
-from scanfind.near_surface import near_model
+from scanfind.grid.moments import MomentGrid
+from scanfind.grid.scene import first_cell
+from scanfind.isolation.isolate import IsolateParameters, Isolator, Placed, joined, pieces_of
+from scanfind.library.near_surface import near_model
 from scanfind.parameters import Parameters
 from scanfind.pose import Pose
-from scanfind.recognise import Standing
-from scanfind.scene import first_cell
-from scanfind.sizes import Size, Sizes, by_size
-from scanfind.sources import Scan, source_of
+from scanfind.recognition.recognise import Standing
+from scanfind.recognition.sizes import Size, Sizes, by_size
+from scanfind.scans.sources import Scan, source_of
 from scanfind.tiles.plan import BASE_BYTES, Tile, bin_metres, margin_bins
 from scanfind.tiles.stored import Store, beams_into, count_in, parts_of, rows_in, summed_rows
 
 if TYPE_CHECKING:
     from scanfind.kernels.distance import NearSurface
-    from scanfind.model import Model
+    from scanfind.library.model import Model
 
 # A grid is written out when it takes a third of the memory: its arrays double, and a chunk of points lies beside it.
 GRID_SHARE = 1.0 / 3.0

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from scanfind.model import Model
+    from scanfind.library.model import Model
 
 Floats = NDArray[np.float64]
 

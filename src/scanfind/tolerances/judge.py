@@ -13,9 +13,9 @@ from math import degrees, hypot, inf
 
 import numpy as np
 
-from scanfind.elements import IN_TOLERANCE, INSTALLED, OUT_OF_TOLERANCE
-from scanfind.explain import STATUS_WORDS, length
-from scanfind.schema import DetectionEntry, ElementEntry, ModelEntry, MotionEntry, PartEntry, Results
+from scanfind.design.elements import IN_TOLERANCE, INSTALLED, OUT_OF_TOLERANCE
+from scanfind.results.explain import STATUS_WORDS, length
+from scanfind.results.schema import DetectionEntry, ElementEntry, ModelEntry, MotionEntry, PartEntry, Results
 from scanfind.tolerances.discs import Disc
 from scanfind.tolerances.profile import Limit, Profile
 

@@ -1,0 +1,1 @@
+"""A design held against the scans: elements and their statuses, and where its frame lies in theirs."""

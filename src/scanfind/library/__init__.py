@@ -1,0 +1,360 @@
+"""The model library (paper 3.2, the offline phase): what is computed once for a model and looked up in every scene.
+
+Models accumulate in one SQLite file. A model already there, by a hash of its geometry and parameters, costs no work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.cloud import CloudModel, OrientedCloud
+from scanfind.errors import LibraryError, ScanfindError
+from scanfind.library.model import DEFAULTS, Model, ModelParameters, ModelSummary, build_model, model_hash
+from scanfind.library.pairs import PairParameters, PairTable, key_count
+from scanfind.library.self_similar import Similar
+from scanfind.library.store import Record, Store
+from scanfind.library.surface import SurfaceParameters
+from scanfind.mesh import Mesh, Placement
+from scanfind.pose import Pose
+from scanfind.symmetry import Axis, Symmetry
+
+__all__ = ["JointTable", "Model", "ModelLibrary", "ModelParameters", "ModelSummary", "joint_table"]
+
+
+class ModelLibrary:
+    """Models by name, in one file or in memory. Iterates over the names, sorted; a context manager.
+
+    Several processes may use one file at once; one ModelLibrary belongs to the thread that opened it. Every method
+    raises LibraryError where the file is damaged, locked for too long or cannot be written.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+
+    @staticmethod
+    def open(path: str | Path, *, create: bool = False, timeout_s: float = 30.0) -> ModelLibrary:
+        """Open the library file at `path`; only `create=True` makes one where there is none.
+
+            timeout_s : how long to wait for another process that is writing
+
+        Raises LibraryError for a file that is missing, no library, damaged, of another version or locked too long.
+        """
+        return ModelLibrary(Store.open(Path(path), create=create, timeout_s=timeout_s))
+
+    @staticmethod
+    def in_memory() -> ModelLibrary:
+        """An empty library that vanishes when closed."""
+        return ModelLibrary(Store.in_memory())
+
+    def add(self, model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS) -> Model:
+        """Prepare a model and keep it; where its geometry and parameters are there already, return what is there.
+
+        A model known under another name keeps that name. Placements it brings join those known, by GlobalId. Raises
+        LibraryError where another model has the name, InvalidGeometryError where the model has no surface.
+        """
+        sha256 = model_hash(model, parameters)
+        with self._store.transaction():
+            known = self._is_known(sha256, model.name)
+        if known:
+            return self._join_placements(sha256, model.placements if isinstance(model, Mesh) else ())
+        # Outside any transaction, because it takes seconds: others go on meanwhile, and may add the same model.
+        return self.put(build_model(model, parameters))
+
+    def put(self, model: Model) -> Model:
+        """Keep a model that is prepared already, such as one of another library; otherwise as `add`."""
+        with self._store.transaction(write=True):
+            if not self._is_known(model.sha256, model.name):
+                self._store.insert(Record(model.sha256, model.name, _facts(model)), _arrays(model))
+                return model
+        return self._join_placements(model.sha256, model.placements)
+
+    def remove(self, name: str) -> None:
+        """Forget a model; raises LibraryError where there is none of that name."""
+        with self._store.transaction(write=True):
+            self._store.delete(self._named(name))
+
+    def names(self) -> list[str]:
+        """All names, sorted by code point."""
+        return [summary.name for summary in self.show()]
+
+    def get(self, name: str) -> Model:
+        """The model of that name; raises LibraryError where there is none."""
+        with self._store.transaction():
+            return self._load(self._named(name))
+
+    def models(self) -> list[Model]:
+        """All models, sorted by name."""
+        with self._store.transaction():
+            return [self._load(record) for record in self._store.records()]
+
+    def show(self) -> list[ModelSummary]:
+        """What is there, sorted by name, without reading the arrays."""
+        with self._store.transaction():
+            return [self._summary(record) for record in self._store.records()]
+
+    def close(self) -> None:
+        """Close the file. Nothing is lost without it: every add and remove is on disk when it returns."""
+        self._store.close()
+
+    def __len__(self) -> int:
+        return len(self.show())
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names())
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _is_known(self, sha256: str, name: str) -> bool:
+        if self._store.by_hash(sha256):
+            return True
+        if not name or not _is_text(name):
+            msg = f"a model needs a name that is text, got {name!r}; give it another"
+            raise LibraryError(msg)
+        if self._store.by_name(name):
+            msg = f"model {name!r} is there already, of other geometry or parameters; remove it or rename the new one"
+            raise LibraryError(msg)
+        return False
+
+    def _named(self, name: str) -> Record:
+        record = self._store.by_name(name) if _is_text(name) else None
+        if record is None:
+            there = [repr(record.name) for record in self._store.records()]
+            msg = f"no model {name!r} in the library; it has {', '.join(there[:10]) or 'none'}"
+            if len(there) > 10:
+                msg += f" and {len(there) - 10} more"
+            raise LibraryError(msg)
+        return record
+
+    def _join_placements(self, sha256: str, placements: tuple[Placement, ...]) -> Model:
+        """The model of that hash, with these placements beside those it has; the newer one of a GlobalId holds."""
+        with self._store.transaction():
+            model = self._by_hash(sha256)
+        known = {placement.global_id: _placement_facts(placement) for placement in model.placements}
+        if all(_placement_facts(placement) == known.get(placement.global_id) for placement in placements):
+            return model
+        with self._store.transaction(write=True):
+            model = self._by_hash(sha256)  # again: another process may just have joined its own
+            joined = tuple({p.global_id: p for p in (*model.placements, *placements)}.values())
+            mesh = replace(model.mesh, placements=joined) if model.mesh else None
+            model = replace(model, placements=joined, mesh=mesh)
+            self._store.replace(Record(sha256, model.name, _facts(model)))
+        return model
+
+    def _by_hash(self, sha256: str) -> Model:
+        record = self._store.by_hash(sha256)
+        if record is None:
+            msg = "another process removed the model while it was being added; add it again"
+            raise LibraryError(msg)
+        return self._load(record)
+
+    def _load(self, record: Record) -> Model:
+        arrays = self._store.arrays(record)
+        try:
+            return _model(record, arrays)
+        except (KeyError, TypeError, ValueError, ScanfindError):
+            self._store.damaged(f"model {record.name!r}")
+
+    def _summary(self, record: Record) -> ModelSummary:
+        try:
+            facts = record.facts
+            return ModelSummary(
+                record.name,
+                record.sha256,
+                str(facts["source"]),
+                float(facts["diameter"]),
+                int(facts["samples"]),
+                int(facts["pairs"]),
+                int(facts["triangles"]),
+                len(facts["placements"]),
+                _symmetry(facts["symmetry"]),
+            )
+        except (KeyError, TypeError, ValueError, ScanfindError):
+            self._store.damaged(f"model {record.name!r}")
+
+
+def _is_text(name: str) -> bool:
+    """False for what Linux allows in a file name and SQLite does not take: bytes that are no UTF-8."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in name)
+
+
+def _facts(model: Model) -> dict[str, Any]:
+    """What a record says of a model beside its arrays; JSON keeps every digit of a float."""
+    return {
+        "source": model.source,
+        "diameter": model.diameter,
+        "spacing": model.spacing,
+        "signed": model.signed,
+        "samples": len(model.samples),
+        "pairs": len(model.pairs.keys),
+        "triangles": len(model.mesh.faces) if model.mesh else 0,
+        "parameters": asdict(model.parameters),
+        "symmetry": {"centre": model.symmetry.centre.tolist(), "axes": model.symmetry.axes},
+        "similar": [{"overlap": each.overlap, **_pose_facts(each.motion)} for each in model.similar],
+        "placements": [_placement_facts(placement) for placement in model.placements],
+        "parts": list(model.mesh.notes.get("parts", ())) if model.mesh else [],
+    }
+
+
+def _placement_facts(placement: Placement) -> dict[str, Any]:
+    return {
+        "global_id": placement.global_id,
+        "ifc_class": placement.ifc_class,
+        "name": placement.name,
+        **_pose_facts(placement.design_from_model),
+    }
+
+
+def _pose_facts(pose: Pose) -> dict[str, Any]:
+    return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
+
+
+def _pose(facts: Mapping[str, Any]) -> Pose:
+    return Pose(np.array(facts["rotation"], np.float64), np.array(facts["translation"], np.float64))
+
+
+def _symmetry(facts: Mapping[str, Any]) -> Symmetry:
+    axes = [Axis((float(x), float(y), float(z)), int(order)) for (x, y, z), order in facts["axes"]]
+    return Symmetry(np.array(facts["centre"], np.float64), tuple(axes))
+
+
+def _placement(facts: Mapping[str, Any]) -> Placement:
+    return Placement(facts["global_id"], facts["ifc_class"], facts["name"], _pose(facts))
+
+
+def _arrays(model: Model) -> dict[str, NDArray[Any]]:
+    arrays: dict[str, NDArray[Any]] = {
+        "points": model.samples.points,
+        "normals": model.samples.normals,
+        **model.pairs._asdict(),
+    }
+    if model.mesh:
+        arrays["vertices"] = np.asarray(model.mesh.vertices, np.float64)
+        arrays["faces"] = np.asarray(model.mesh.faces, np.int32)
+    if model.cloud:
+        arrays["cloud"] = np.asarray(model.cloud.points, np.float64)
+        if model.cloud.origin is not None:
+            arrays["origin"] = np.asarray(model.cloud.origin, np.float64)
+    return arrays
+
+
+def _model(record: Record, arrays: Mapping[str, NDArray[Any]]) -> Model:
+    """The model of a record. Raises KeyError, TypeError, ValueError or ScanfindError where they do not fit."""
+    facts = record.facts
+    surface, pairs = facts["parameters"]["surface"], facts["parameters"]["pairs"]
+    parameters = ModelParameters(
+        SurfaceParameters(**surface),
+        PairParameters(**{**pairs, "distances": tuple(pairs["distances"])}),
+        facts["parameters"]["symmetry"],
+    )
+    placements = tuple(_placement(placement) for placement in facts["placements"])
+    mesh = cloud = None
+    if "faces" in arrays:
+        vertices = _shaped(arrays["vertices"], np.float64, (-1, 3))
+        faces = _within(_shaped(arrays["faces"], np.int32, (-1, 3)), len(vertices))
+        # A library written before parts were kept has none.
+        parts = tuple((str(name), int(first), int(end)) for name, first, end in facts.get("parts", ()))
+        mesh = Mesh(record.name, vertices, faces, facts["source"], placements, {"parts": parts} if parts else {})
+    else:
+        origin = _shaped(arrays["origin"], np.float64, (3,)) if "origin" in arrays else None
+        cloud = CloudModel(record.name, _shaped(arrays["cloud"], np.float64, (-1, 3)), facts["source"], origin)
+    points, normals = (_shaped(arrays[role], np.float64, (-1, 3)) for role in ("points", "normals"))
+    samples = OrientedCloud(points, _shaped(normals, np.float64, points.shape), facts["signed"])
+    # The kernels trust what they get: an index out of range would read foreign memory.
+    keys = _within(_shaped(arrays["keys"], np.int32, (-1,)), key_count(parameters.pairs))
+    ends = (_within(_shaped(arrays[role], np.int32, keys.shape), len(points)) for role in ("first", "second"))
+    if (np.diff(keys) < 0).any():
+        raise ValueError(keys)
+    return Model(
+        name=record.name,
+        sha256=record.sha256,
+        source=facts["source"],
+        diameter=float(facts["diameter"]),
+        spacing=float(facts["spacing"]),
+        signed=bool(facts["signed"]),
+        samples=samples,
+        mesh=mesh,
+        cloud=cloud,
+        pairs=PairTable(keys, *ends),
+        symmetry=_symmetry(facts["symmetry"]),
+        similar=tuple(Similar(float(each["overlap"]), _pose(each)) for each in facts["similar"]),
+        placements=placements,
+        parameters=parameters,
+    )
+
+
+def _shaped(array: NDArray[Any], dtype: type, shape: tuple[int, ...]) -> NDArray[Any]:
+    fits = array.ndim == len(shape) and all(want in {-1, have} for want, have in zip(shape, array.shape, strict=True))
+    if array.dtype != dtype or not fits:
+        raise ValueError(shape)
+    return array
+
+
+def _within(indices: NDArray[Any], end: int) -> NDArray[Any]:
+    if indices.size and not 0 <= indices.min() <= indices.max() < end:
+        raise ValueError(end)
+    return indices
+
+
+class JointTable(NamedTuple):
+    """The pairs of several models by key, in CSR form: pairs offsets[k] … offsets[k + 1] have key k.
+
+    offsets : (C + 1,) int64 over the C keys
+    model, first, second : (K,) int32, the model's place in the list and its two samples; sorted by model within a key
+    """
+
+    offsets: NDArray[np.int64]
+    model: NDArray[np.int32]
+    first: NDArray[np.int32]
+    second: NDArray[np.int32]
+
+
+def joint_table(models: Sequence[Model], *, each_once: bool = False) -> JointTable:
+    """One hash table for all models, so that a pair of scene points is looked up once (paper 3.4).
+
+    each_once : of pairs that a model's symmetry maps onto one another only one: their hypotheses look the same
+
+    Raises LibraryError for no models, or models whose keys do not mean the same.
+    """
+    layouts = {(m.parameters.pairs.angle_cell_deg, m.parameters.pairs.rungs_per_octave) for m in models}
+    if len(layouts) != 1:
+        what = f"(angle_cell_deg, rungs_per_octave) {sorted(layouts)}" if layouts else "no models"
+        msg = f"models searched together must share one layout of keys, got {what}; add them with the same parameters"
+        raise LibraryError(msg)
+    cells = key_count(models[0].parameters.pairs)
+    tables = [pairs_once(m) if each_once else m.pairs for m in models]
+    offsets = np.zeros(cells + 1, np.int64)
+    for pairs in tables:
+        offsets[1:] += np.bincount(pairs.keys, minlength=cells)
+    np.cumsum(offsets, out=offsets)
+    table = JointTable(offsets, *(np.empty(offsets[-1], np.int32) for _ in range(3)))
+    # Each model's keys are sorted already: a pair goes to its cell's next free place plus its rank within the cell.
+    free = offsets[:-1].copy()
+    for number, pairs in enumerate(tables):
+        counts = np.bincount(pairs.keys, minlength=cells)
+        starts = np.cumsum(counts) - counts
+        place = (free - starts)[pairs.keys] + np.arange(len(pairs.keys))
+        table.model[place], table.first[place], table.second[place] = number, pairs.first, pairs.second
+        free += counts
+    return table
+
+
+def pairs_once(model: Model) -> PairTable:
+    """The pairs of a model but for those that its symmetry makes of others: whose first sample stands for its like."""
+    kept = model.symmetry.stands_for_its_like(model.samples.points)[model.pairs.first]
+    return PairTable(*(column[kept] for column in model.pairs))

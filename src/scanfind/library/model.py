@@ -1,0 +1,146 @@
+"""A model ready for the search: what the paper's offline phase computes once (3.2, Algorithm 1)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from scanfind.cloud import CloudModel, OrientedCloud
+from scanfind.library.cloud_surface import sample_cloud
+from scanfind.library.onto_itself import OntoItself
+from scanfind.library.pairs import PairParameters, PairTable, build_pairs
+from scanfind.library.self_similar import Similar, find_similar
+from scanfind.library.surface import SurfaceParameters, sample_mesh
+from scanfind.library.symmetries import declared_symmetry, find_symmetry
+from scanfind.mesh import Mesh, Placement
+from scanfind.symmetry import Symmetry, parse_axes
+
+# Part of every model's hash: raise it when the samples or pairs of one and the same model come out differently.
+RECIPE = "scanfind model, recipe 1"
+# Poisson disks jam at 0.56 of the plane, not at the 0.91 of a hexagonal packing: a sample stands for 1.4 spacing².
+AREA_OF_A_SAMPLE = 1.4
+
+
+@dataclass(frozen=True)
+class ModelParameters:
+    """How a model is prepared for the search.
+
+    symmetry : axes of the model with their order, such as "x2", "z4,x2" or "z*" (every angle), or "none"; None: found
+    """
+
+    surface: SurfaceParameters = field(default_factory=SurfaceParameters)
+    pairs: PairParameters = field(default_factory=PairParameters)
+    symmetry: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.symmetry is not None:
+            parse_axes(self.symmetry)
+
+
+DEFAULTS = ModelParameters()
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A model ready for the search.
+
+    sha256 : hash of geometry and parameters; the name is no part of it
+    diameter : the paper's ρ = diam(M), metres
+    spacing : distance between neighbouring samples, metres
+    signed : the normals of the samples point outwards; False where nobody knows their side
+    samples : (N,) oriented points a scanner could see, model frame, every prefix evenly spread
+    mesh : the triangles, for isolation; None for a model that is a piece of scan
+    cloud : that piece of scan; None for a mesh
+    pairs : the oriented pairs of the samples with their keys
+    symmetry : the rotations after which no scan could tell that it was turned
+    similar : motions after which it could be taken for itself, though it is not, likeliest first
+    placements : the design's products of this geometry
+    """
+
+    name: str
+    sha256: str
+    source: str
+    diameter: float
+    spacing: float
+    signed: bool
+    samples: OrientedCloud
+    mesh: Mesh | None
+    cloud: CloudModel | None
+    pairs: PairTable
+    symmetry: Symmetry
+    similar: tuple[Similar, ...]
+    placements: tuple[Placement, ...]
+    parameters: ModelParameters
+
+    def area_of_a_sample(self) -> float:
+        """The surface a sample stands for, m²."""
+        return AREA_OF_A_SAMPLE * self.spacing**2
+
+    def exposed_area(self) -> float:
+        """The surface a scanner could see, m²."""
+        return self.area_of_a_sample() * len(self.samples)
+
+
+class ModelSummary(NamedTuple):
+    """What a list of models shows: counts, and the diameter in metres. `triangles` is 0 for a piece of scan."""
+
+    name: str
+    sha256: str
+    source: str
+    diameter: float
+    samples: int
+    pairs: int
+    triangles: int
+    placements: int
+    symmetry: Symmetry
+
+
+def model_hash(model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS) -> str:
+    """SHA-256 over the geometry and the parameters, as hexadecimal digits: equal hash, equal samples and pairs."""
+    if isinstance(model, Mesh):
+        arrays = [np.asarray(model.vertices, "<f8"), np.asarray(model.faces, "<i4")]
+    else:
+        arrays = [np.asarray(model.points, "<f8")]
+        arrays += [] if model.origin is None else [np.asarray(model.origin, "<f8")]
+    shapes = [array.shape for array in arrays]
+    # The shapes go in front, so that no two lists of arrays run together into the same bytes.
+    head = json.dumps([RECIPE, type(model).__name__, shapes, asdict(parameters)], sort_keys=True)
+    digest = hashlib.sha256(head.encode())
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def build_model(model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS) -> Model:
+    """Sample a model's surface and hash its pairs (Algorithm 1). Raises InvalidGeometryError."""
+    if isinstance(model, Mesh):
+        surface = sample_mesh(model, parameters.surface)
+        # Of the notes, which are for the person who reads the file, the library keeps what the fit of parts needs.
+        notes = {key: model.notes[key] for key in ("parts",) if key in model.notes}
+        mesh, cloud = Mesh(model.name, model.vertices, model.faces, model.source, model.placements, notes), None
+    else:
+        surface = sample_cloud(model, parameters.surface)
+        mesh, cloud = None, model
+    itself = OntoItself(surface, mesh)
+    declared = parameters.symmetry
+    symmetry = find_symmetry(itself) if declared is None else declared_symmetry(itself, parse_axes(declared))
+    return Model(
+        name=model.name,
+        sha256=model_hash(model, parameters),
+        source=model.source,
+        diameter=surface.diameter,
+        spacing=surface.spacing,
+        signed=surface.signed,
+        samples=surface.samples,
+        mesh=mesh,
+        cloud=cloud,
+        pairs=build_pairs(surface.samples, surface.diameter, surface.spacing, parameters.pairs),
+        symmetry=symmetry,
+        similar=find_similar(itself, symmetry),
+        placements=mesh.placements if mesh else (),
+        parameters=parameters,
+    )

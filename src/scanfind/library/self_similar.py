@@ -1,0 +1,140 @@
+"""What a model could be taken for: motions after which much of it lies on itself, though it is not where it was.
+
+The paper's box frame, turned over, still covers nine tenths of itself. Such poses are the ones a search is most likely
+to take for the right one; they are tried against the best pose before it is believed. True symmetries are none of them:
+no scan can tell these apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import permutations, product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.library.onto_itself import OntoItself, any_across, unit
+from scanfind.pose import Pose
+from scanfind.symmetry import Symmetry, pose_error
+
+Floats = NDArray[np.float64]
+
+# Below this a motion leads to another pose altogether, which the search would find by itself.
+LEAST_OVERLAP = 0.35
+MOST_SIMILAR = 12
+SQUARE = np.cos(np.radians(4.0))  # faces turned less than this off the model's axes propose the same turns
+# Motions that differ by less than this share of the diameter lead to one pose: ICP draws them together.
+ALIKE = 1.0 / 15.0
+# The table of shifts: samples paired, its cell in spacings of these, and most cells to either side of none.
+SHIFT_SAMPLES, SHIFT_CELL, SHIFT_CELLS = 1500, 2.0, 30
+MOST_SHIFTS = 20
+# A repetition: so many spacings to either side of it, the model lies on itself clearly less.
+SHIFT_FLANK, SHIFT_DIP = 4.0, 0.9
+
+
+class Similar(NamedTuple):
+    """A motion model_from_model that is no symmetry, and the share of the model's samples it brings onto samples."""
+
+    overlap: float
+    motion: Pose
+
+
+def find_similar(model: OntoItself, symmetry: Symmetry) -> tuple[Similar, ...]:
+    """Motions that bring at least `LEAST_OVERLAP` of the samples onto samples and are no symmetry, best first.
+
+    Tried are the turns of a cube about the middle of the model's box, along its own axes, its largest plane faces and
+    its principal axes, and the shifts by which the model repeats itself (the bays of a rack).
+    """
+    kept = [Similar(1.0, Pose.identity())]
+
+    def is_new(motion: Pose) -> bool:
+        return all(_differ(model, motion, other.motion, symmetry) for other in kept)
+
+    proposed = [Similar(model.overlap(motion), motion) for motion in [*_turned(model), *_shifted(model)]]
+    for rough in sorted(proposed, key=lambda each: -each.overlap):
+        if rough.overlap >= LEAST_OVERLAP and is_new(rough.motion):
+            motion = model.settled(rough.motion)
+            if is_new(motion):
+                kept.append(Similar(model.overlap(motion), motion))
+    best = sorted(kept[1:], key=lambda each: -each.overlap)
+    return tuple(each for each in best if each.overlap >= LEAST_OVERLAP)[:MOST_SIMILAR]
+
+
+def _differ(model: OntoItself, one: Pose, other: Pose, symmetry: Symmetry) -> bool:
+    error = pose_error(one, other, symmetry)
+    return error.translation_m + model.radius * error.rotation_rad > ALIKE * model.diameter
+
+
+def _turned(model: OntoItself) -> Iterator[Pose]:
+    """Turns of a cube along the model's own axes, those of its largest plane faces, and its principal ones."""
+    principal = np.linalg.svd(model.points - model.centre, full_matrices=False)[2]
+    faced = _faced(model)
+    square = (np.abs(faced) > SQUARE).any(axis=1).all()  # to the model's own axes
+    for axes in (np.eye(3), principal) if square else (np.eye(3), faced, principal):
+        axes[2] = np.cross(axes[0], axes[1])
+        along = model.points @ axes.T
+        middle = 0.5 * (along.min(axis=0) + along.max(axis=0)) @ axes
+        for turn in cube_turns()[1:]:
+            rotation = axes.T @ turn @ axes
+            yield Pose(rotation, middle - rotation @ middle)
+
+
+def _faced(model: OntoItself) -> Floats:
+    """Axes (3, 3), as rows, along the largest plane faces; the coordinate axes where there are none."""
+    facets = model.facets
+    if not facets:
+        return np.eye(3)
+    beside = next((b for b in facets[1:] if abs(b @ facets[0]) < 0.1), any_across(facets[0]))
+    beside = unit(beside - (beside @ facets[0]) * facets[0])
+    return np.array([facets[0], beside, np.cross(facets[0], beside)])
+
+
+def _shifted(model: OntoItself) -> Iterator[Pose]:
+    """Shifts, there and back, at which the model lies on itself clearly better than a little farther or nearer, and
+    no worse than a little aside: a beam slides along itself as well, and no place there is better than the next.
+    """
+    for shift in _shifts(model):
+        here, step = model.overlap(shifted(shift)), SHIFT_FLANK * model.spacing
+        if here < LEAST_OVERLAP:
+            continue
+        ends = [model.overlap(shifted(shift + side * step * unit(shift))) for side in (-1, 1)]
+        aside = (model.overlap(shifted(shift + side * step * axis)) for axis in np.eye(3) for side in (-1, 1))
+        if max(ends) < SHIFT_DIP * here and all(each <= here for each in aside):
+            yield shifted(shift)
+            yield shifted(-shift)
+
+
+def _shifts(model: OntoItself) -> Floats:
+    """The likeliest, (K, 3): peaks of how often each shift leads from a sample to one of like normal."""
+    from scanfind.kernels.overlap import count_shifts
+
+    count = min(SHIFT_SAMPLES, len(model.points))
+    points, normals = model.points[:count], model.normals[:count]
+    extent = np.ptp(points, axis=0)
+    cell = max(SHIFT_CELL * model.spacing * np.sqrt(len(model.points) / count), extent.max() / SHIFT_CELLS)
+    reach = np.ceil(extent / cell).astype(np.int64) + 1
+    table = np.zeros(2 * reach + 1, np.int64)
+    count_shifts(points, normals, model.signed, 1.0 / cell, reach, table)
+    highest_around = np.lib.stride_tricks.sliding_window_view(np.pad(table, 1), (3, 3, 3)).max(axis=(3, 4, 5))
+    peaks = np.argwhere((table == highest_around) & (table > 0))
+    shifts = (peaks - reach) * cell
+    far = np.linalg.norm(shifts, axis=1) > max(ALIKE * model.diameter, 2 * SHIFT_FLANK * model.spacing)
+    best = np.argsort(-table[tuple(peaks.T)] * far, kind="stable")[:MOST_SHIFTS]
+    return np.asarray(shifts[best[far[best]]])
+
+
+def shifted(shift: Floats) -> Pose:
+    """The motion by (3,) without a turn."""
+    return Pose(np.eye(3), np.asarray(shift))
+
+
+def cube_turns() -> list[Floats]:
+    """The 24 rotations (3, 3) that map the coordinate axes onto each other."""
+    turns = []
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        turn = np.zeros((3, 3))
+        turn[np.arange(3), order] = signs
+        if np.linalg.det(turn) > 0:
+            turns.append(turn)
+    return turns

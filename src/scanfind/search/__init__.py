@@ -1,0 +1,1 @@
+"""Hypotheses: pairs drawn from the scene, looked up, posed and tested; of surface and of lines."""

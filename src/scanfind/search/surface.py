@@ -1,0 +1,327 @@
+"""RANSAC over the scene: draw, look up, pose, test (paper 3.3 and 3.4, Algorithm 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import exp, log
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.cloud import OrientedCloud
+from scanfind.errors import require
+from scanfind.grid.scene import flatness_above
+from scanfind.library.pairs import rungs_of
+from scanfind.search.draws import Draws, Trial, affordable, wald_table
+from scanfind.search.hypotheses import Hypotheses, no_hypotheses
+
+if TYPE_CHECKING:
+    from scanfind.grid.scene import Scene
+    from scanfind.library import JointTable
+    from scanfind.library.model import Model
+    from scanfind.search.hypotheses import ModelArrays
+
+Floats = NDArray[np.float64]
+
+# What was found first was easier to find than what was not: its rate is halved before it is asked of others.
+LEARNT = 0.5
+# Cells drawn from: fewer make pairs that repeat each other, more cost more to fit than they add to a round's pairs.
+LEAST_POOL, MOST_POOL = 20_000, 60_000
+ROUNDS_A_POOL = 4  # draw from mostly the same cells, which are fitted then; small parts need others in the long run
+# The first round tells how easily an instance is found, and often finds all there is. Rounds after it: a little more
+# than is missing, and enough to be worth refining; rather a little more in one round than two.
+FIRST_ROUND, ROUND_MARGIN, LEAST_ROUND, MOST_ROUND = 0.3, 1.1, 0.15, 1.3
+# With so many scanner positions nearly every sample faces one, and asking costs more than it tells.
+FACING_ORIGINS = 6
+SHAPED = 1000  # samples whose shape tells that of a model, each against all of them
+# Borders between classes of bend, in shares of the window: range noise of 2 mm on a plane is below the first for
+# windows over 0.1 m, a pipe as wide as the window above the last.
+BEND_BORDERS = (0.02, 0.05, 0.1)
+# A pair that lies on an instance finds it when noise left its feature in the right cell of the hash table and one of
+# the model's pairs there is near enough: measured 0.5 on spools, 0.05 – 0.4 on frames, far less on sparse ones. Only
+# until an instance is found; then it is counted (Search.learn).
+RIGHT_PAIR_FINDS = 0.006
+# Where nothing at all is found, an instance is looked for that shows only half of λs, the paper's own 0.15, for so many
+# full rounds. Of parts that lost 60 to 70 % of their points every one that was found then was found in the first.
+DEEPER, DEEPER_ROUNDS = 0.5, 2.0
+# A surfel's normal counts as clean below so much of a cell, noise apart; but never fewer than this share of a shape's.
+# Drawing only those doubled the right poses a round finds, on spools and frames.
+CLEAN_CELLS, CLEAN_SHARE = 0.1, 0.3
+
+
+@dataclass(frozen=True)
+class SearchParameters:
+    """How the search is carried out.
+
+    overlap_ratio : λs, the share of a model's samples that must lie on the scene (the paper: 0.15) …
+    facing_only : … of those that face a scanner position, where all are known: a chunky part seen from one side shows a
+        quarter of its surface
+    deeper : where nothing at all is found, look for instances that show half of `overlap_ratio`
+    time_limit_s : seconds for search, verification and refinement together; None: until nothing is likely to be missed
+    miss_probability : stop when an instance that shows `overlap_ratio` of its surface has been missed with less than
+        this chance; 0: use all of the time limit, as the paper does
+    max_instances : stop after so many detections; None: all there are
+    expected : instances of each model: one found so many times is looked for no further; None: nobody knows
+    pairs_a_round, hypotheses_a_round : scene pairs drawn before any is tested; hypotheses tested before any is refined
+    by_shape : draw points by the likelihood ratio of their local shape: how bent the surface around them is, on the
+        model as against in the scene; walls and floors are most of a scan and little of a spool
+    telling_first : test pairs first whose feature is rare in this scene: the chance of a pair to be right, over the
+        cost of testing it, is one over how often the scene shows its feature
+    each_once : of a model's pairs that its symmetry maps onto one another look up only one: a pipe's pairs are the same
+        all around it, and so are the poses they lead to
+    by_lines : where nothing is found, look for a model of thin members by these, as lines (see lines)
+    normal_length_m : of the normals in the four-point sets (the paper: 1); 0: its limit, the roll alone from normals
+    max_tries : places tried for s2 before another s1 is drawn
+    tests : model samples in the sequential test
+    chance_overlap : share of samples of a wrong hypothesis that lie on the scene, for Wald's test
+    test_cells_across : cells of the test along the smallest diameter of a model; fewer where the scan is sparse
+    kept : hypotheses refined each round, for each model
+    """
+
+    overlap_ratio: float = 0.3
+    deeper: bool = True
+    time_limit_s: float | None = 60.0
+    miss_probability: float = 0.01
+    max_instances: int | None = None
+    expected: int | None = None
+    pairs_a_round: int = 100_000
+    hypotheses_a_round: int = 200_000
+    facing_only: bool = True
+    by_shape: bool = True
+    telling_first: bool = True
+    each_once: bool = True
+    by_lines: bool = True
+    normal_length_m: float = 0.0
+    max_tries: int = 1000
+    tests: int = 192
+    chance_overlap: float = 0.15
+    test_cells_across: float = 45.0
+    kept: int = 48
+
+    def __post_init__(self) -> None:
+        require(0.0 < self.overlap_ratio <= 1.0, "overlap_ratio", self.overlap_ratio, "above 0 and at most 1")
+        limit = self.time_limit_s
+        require(limit is None or limit >= 0.0, "time_limit_s", limit, "0 seconds or more")
+        require(0.0 <= self.miss_probability < 1.0, "miss_probability", self.miss_probability, "from 0 to below 1")
+        require(
+            limit is not None or self.miss_probability > 0.0, "time_limit_s", limit, "given where miss_probability is 0"
+        )
+        require(self.max_instances is None or self.max_instances >= 1, "max_instances", self.max_instances, "1 or more")
+        require(self.expected is None or self.expected >= 1, "expected", self.expected, "1 or more")
+        require(0.0 < self.chance_overlap < 0.5, "chance_overlap", self.chance_overlap, "above 0 and below 0.5")
+        require(self.normal_length_m >= 0.0, "normal_length_m", self.normal_length_m, "0 or more metres")
+        require(self.test_cells_across >= 4.0, "test_cells_across", self.test_cells_across, "4 or more")
+        for name in ("pairs_a_round", "hypotheses_a_round", "max_tries", "tests", "kept"):
+            require(getattr(self, name) >= 1, name, getattr(self, name), "1 or more")
+
+
+class Search:
+    """The rounds of RANSAC over one scene, for all models together; the same seed gives the same rounds."""
+
+    def __init__(
+        self, scene: Scene, models: Sequence[Model], table: JointTable, arrays: ModelArrays,
+        parameters: SearchParameters, seed: int, jobs: int, learnt: Sequence[float] = (),
+    ) -> None:  # fmt: skip
+        """learnt : of each model, the share of right pairs that found it elsewhere; 0, or nothing: nobody knows."""
+        self.scene, self.models, self.table, self.arrays = scene, models, table, arrays
+        self.parameters, self.seed, self.jobs = parameters, seed, jobs
+        self.pairs = models[0].parameters.pairs
+        self.rungs = sorted({rung for m in models for rung in rungs_of(m.diameter, m.parameters.pairs)}, reverse=True)
+        window = 3.0 * scene.around.cell
+        self._classes = shape_classes(flatness_above(scene.fine, 2, scene.around), window)
+        self._free = np.ones(len(scene.fine.cells), np.bool_)
+        known = parameters.facing_only and scene.fine.signed and len(scene.depths) <= FACING_ORIGINS
+        self._origins = scene.origins() if known else np.empty((0, 3))
+        self.model_shapes = np.array([model_shape(model, window) for model in models])
+        # As far as two samples of a model may be off, but never less than the scene's own resampling.
+        self._tolerance = max(scene.fine.cell, self.pairs.tolerance * min(model.spacing for model in models))
+        self._signed = scene.fine.signed and all(model.signed for model in models)
+        self.rounds, self.effort, self._last_share = 0, 0.0, 1.0
+        self.pool = np.empty(0, np.intp)
+        self._fill_pool()
+        self._finds = np.where(np.asarray(learnt) > 0.0, learnt, RIGHT_PAIR_FINDS) if len(learnt) else RIGHT_PAIR_FINDS
+        self._right, self._last_right = np.zeros(len(models)), np.zeros(len(models))
+        self._served = np.zeros(len(models), np.bool_)  # models of which no further instance is wanted
+        # Of the instances found: hits, and what they showed, in full rounds and in right pairs of one that shows λs.
+        self._learned = np.zeros((len(models), 3))
+        self._look_for(parameters.overlap_ratio)
+
+    def _look_for(self, overlap_ratio: float) -> None:
+        """Look for instances that show this share of their surface, and more."""
+        self._shown, self._until, chance = overlap_ratio, 0.0, self.parameters.chance_overlap
+        # A right hypothesis puts so many of its samples on the scene, and chance some of the others.
+        right = overlap_ratio + (1.0 - overlap_ratio) * chance
+        self._least_hits = wald_table(self.parameters.tests, right, chance)
+
+    def look_deeper(self) -> bool:
+        """Look for instances that show half of λs for some rounds; False where that is done already."""
+        deeper = DEEPER * self.parameters.overlap_ratio
+        if not self.parameters.deeper or self._shown <= deeper or not self.pool_left():
+            return False
+        self._look_for(deeper)
+        self._until = self.effort + DEEPER_ROUNDS
+        return True
+
+    def served(self, models: NDArray[np.bool_]) -> None:
+        """Of these models (models,) no further instance is wanted: the search need not go on for them."""
+        self._served = models
+
+    def withdraw(self, cells: NDArray[np.bool_]) -> None:
+        """Draw no more from these cells (V,): they are explained."""
+        self._free &= ~cells
+        self._stale = True
+
+    def _fill_pool(self) -> None:
+        """Choose the surfels that may be drawn: each cell's with a chance by the likelihood ratio of its shape."""
+        counts, kept = self._likelihood(self._free)
+        kept = kept * min(1.0, MOST_POOL / max(float(kept @ counts), 1.0))
+        # Where the telling cells are few, the others fill up: they may be all there is to draw from.
+        while 0 < np.minimum(kept, 1.0) @ counts < min(LEAST_POOL, 0.9 * counts.sum()):
+            kept = kept * 1.25
+        self._kept = np.minimum(kept, 1.0)
+        luck = np.random.default_rng([self.seed, self.rounds // ROUNDS_A_POOL]).random(len(self._classes), np.float32)
+        chance = self._kept.astype(np.float32)[self._classes]
+        fine = self.scene.fine
+        surfels = fine.of(np.flatnonzero(self._free & (luck < chance)))
+        surfels = surfels[fine.has_normal()[surfels]]
+        self.pool = surfels[self._clean(surfels)]
+        self._stale = False
+        points = OrientedCloud(fine.means[self.pool], fine.normals[self.pool], self._signed)
+        self._draws = Draws(points, self.pairs, self.rungs, self._tolerance, self.jobs)
+
+    def _clean(self, surfels: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Which surfels have a normal to rely on: flat but for noise, or among the flatter ones of their shape.
+
+        Across an edge a normal is of neither face, and near edges is where most of the telling surfels are.
+        """
+        fine, classes = self.scene.fine, self._classes[self.scene.fine.cell_of[surfels]]
+        flatness = fine.flatness[surfels]
+        clean: NDArray[np.bool_] = flatness <= np.hypot(self.scene.noise, CLEAN_CELLS * fine.cell)
+        for shape in np.unique(classes):
+            alike = classes == shape
+            clean[alike] |= flatness[alike] <= np.quantile(flatness[alike], CLEAN_SHARE)
+        return clean
+
+    def telling(self) -> tuple[Floats, Floats]:
+        """How much the surfels of each fine and of each coarse cell tell, (V,), 0 … 1: the root of the likelihood ratio
+        of their shape, model against scene.
+
+        A plate flush with a floor lies on the scene with all of its samples, and that means nothing.
+        """
+        _, likelihood = self._likelihood(np.ones(len(self._classes), np.bool_))
+        scene, tells = self.scene, np.sqrt(likelihood)
+        coarse = shape_classes(flatness_above(scene.coarse, 1, scene.around), 3.0 * scene.around.cell)
+        return tells[self._classes], tells[coarse]
+
+    def _likelihood(self, among: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Floats]:
+        """Of C classes of shape, how many of some cells are in each, and its likelihood ratio over the largest, (C,).
+
+        among : (V,) which cells
+        """
+        counts = np.bincount(self._classes[among], minlength=len(BEND_BORDERS) + 1)
+        if not self.parameters.by_shape:
+            return counts, np.ones(len(counts))
+        ratio = np.where(counts > 0, self.model_shapes.mean(axis=0) / np.maximum(counts, 1), 0.0)
+        return counts, ratio / max(ratio.max(), 1e-300)
+
+    def may_stop(self) -> bool:
+        """Is nothing left to draw from, or the chance to have missed an instance of any model below the one allowed?"""
+        if not self.pool_left():
+            return True
+        return self.effort >= self._until if self._until else self.chance_missed() < self.parameters.miss_probability
+
+    def pool_left(self) -> bool:
+        """Is there a pair left to draw?"""
+        return len(self.pool) > 1 and bool(np.count_nonzero(self._free) > 1)
+
+    def chance_missed(self) -> float:
+        """Chance to have missed an instance that shows λs of its surface, for the model worst served so far."""
+        expected = np.where(self._learned[:, 1] > 0.0, self.effort * self._rate(), self._finds * self._right)
+        return exp(-float(expected.min(initial=np.inf, where=~self._served)))
+
+    def _share(self) -> float:
+        """The share of a full round that the next one needs be: as much as is missing."""
+        allowed, missed = self.parameters.miss_probability, self.chance_missed()
+        if allowed == 0.0 or self._until:
+            return 1.0
+        if self.effort == 0.0:
+            return FIRST_ROUND
+        if missed == 1.0:
+            return 1.0
+        needed = self.effort * (log(allowed) / log(missed) - 1.0)
+        return min(MOST_ROUND, max(LEAST_ROUND, ROUND_MARGIN * needed))
+
+    def learn(self, model: int, hits: int, support: float) -> None:
+        """Learn from an instance how often the last round hit it: pairs on it go with the square of what it shows."""
+        shown = (support / self.parameters.overlap_ratio) ** 2
+        self._learned[model] += max(hits, 1), self._last_share * shown, self._last_right[model] * shown
+        self._look_for(self.parameters.overlap_ratio)  # others are looked for as at first
+
+    def _rate(self) -> Floats:
+        """Hits a full round of an instance of each model that shows λs of its surface, from those found, (models,)."""
+        return np.asarray(LEARNT * self._learned[:, 0] / np.maximum(self._learned[:, 1], 1e-300))
+
+    def round(self) -> Hypotheses:
+        """One round: draw pairs, look them up, test their hypotheses; the best of each pair that pass, best first."""
+        if self._stale:
+            self._fill_pool()
+        if len(self.pool) < 2:
+            return no_hypotheses()
+        limits, share = self.parameters, self._share()
+        count = round(share * limits.pairs_a_round / len(self.rungs))
+        drawn = self._draws.draw(count, self.seed, self.rounds, limits.max_tries)
+        # Three of four choices of sides are wrong: as many more hypotheses are tested for the same right pairs.
+        most = share * limits.hypotheses_a_round * self._draws.sides
+        tested = affordable(drawn, self.table, most, rarest_first=limits.telling_first)
+        self._expect(count, drawn.keys, tested.keys)
+        trial = Trial(
+            self.table, self.arrays, self.scene.tolerant, self._origins, self._least_hits, limits.normal_length_m
+        )
+        self.rounds += 1
+        self.effort += share
+        self._last_share = share
+        return trial.test(tested, self._draws.points, self.jobs)
+
+    def _expect(self, drawn_here: int, drawn: NDArray[np.int64], tested: NDArray[np.int64]) -> None:
+        """Add how many right pairs this round tested of an instance of each model that shows `overlap_ratio`.
+
+        drawn_here : pairs at each rung; drawn, tested : keys of those that met a second point, and of those tested
+        """
+        cells, fine, shown = len(self.table.offsets) - 1, self.scene.fine, self.parameters.overlap_ratio
+        self._last_right[:] = 0.0
+        count = np.bincount(drawn, minlength=cells)
+        # None of a feature that was not drawn was left out: without this a scan too small for a pair is never done.
+        share = np.where(count > 0, np.bincount(tested, minlength=cells) / np.maximum(count, 1), 1.0)
+        for number, model in enumerate(self.models):
+            samples, rung_of_pair = len(model.samples), model.pairs.keys // self.pairs.cells_per_rung()
+            # What of an instance that shows λs of its surface would be in the pool.
+            on_it = shown * model.exposed_area() / fine.cell**2 * float((self.model_shapes[number] * self._kept).sum())
+            first_on_it = min(1.0, on_it / max(len(self.pool), 1))
+            for rung in rungs_of(model.diameter, model.parameters.pairs):
+                keys = model.pairs.keys[rung_of_pair == rung]
+                if not len(keys):
+                    continue
+                # The share of its samples a pair's length away, as against all of the pool so far away.
+                shell = 2.0 * model.parameters.pairs.tolerance * model.spacing
+                partners = on_it * len(keys) / samples**2 * 2.0 * self._draws.tolerance / shell
+                second_on_it = partners / max(self._draws.partners(rung), partners, 1e-9)
+                self._last_right[number] += drawn_here * first_on_it * second_on_it * float(share[keys].mean())
+        self._right += self._last_right
+
+
+def shape_classes(bends: NDArray[np.floating], window: float) -> NDArray[np.int8]:
+    """Class of each point by how bent the surface around it is, (N,); bends : (N,), window : both metres."""
+    return np.asarray(np.digitize(bends, np.array(BEND_BORDERS) * window), np.int8)
+
+
+def model_shape(model: Model, window: float) -> Floats:
+    """Share of a model's samples in each class, (C,); none is quite zero: scan and model are not sampled alike."""
+    from scanfind.kernels.shape import bend_of_samples
+
+    # The first ones lie as evenly over the model as all of them.
+    bends = np.empty(min(len(model.samples), SHAPED))
+    bend_of_samples(model.samples.points, model.samples.normals, window, bends)
+    shares = np.bincount(shape_classes(bends, window), minlength=len(BEND_BORDERS) + 1) / len(bends)
+    return np.asarray((shares + 0.02) / (shares + 0.02).sum())
