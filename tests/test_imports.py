@@ -78,7 +78,7 @@ def test_every_public_name_is_there(name: str) -> None:
     assert getattr(scanfind, name) is getattr(scanfind, name)
 
 
-@pytest.mark.parametrize("verb", ["find", "isolate"])
+@pytest.mark.parametrize("verb", ["find", "inspect"])
 def test_a_verb_stays_a_function_whoever_imports_its_module(verb: str) -> None:
     code = f"import scanfind, scanfind.{verb}; from scanfind.{verb} import __name__ as n; print(scanfind.{verb}, n)"
     assert _python("-c", code).startswith(f"<function {verb}")

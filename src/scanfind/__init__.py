@@ -103,7 +103,7 @@ def __dir__() -> list[str]:
 
 
 class _Package(ModuleType):
-    """Keeps `scanfind.find` and `scanfind.isolate` the functions, whoever imports the modules of the same name.
+    """Keeps `scanfind.find` and `scanfind.inspect` the functions, whoever imports the modules of the same name.
 
     Importing a submodule binds it to its package under its name, and would bury the function.
     """
