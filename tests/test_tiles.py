@@ -23,9 +23,11 @@ from scanfind.find import find
 from scanfind.grid.moments import ROW, MomentGrid
 from scanfind.scans import open_writer, read_scan, scan_info
 from scanfind.scans.sources import scans_of
+from scanfind.search.surface import Tally
 from scanfind.tiles import find_in_tiles
 from scanfind.tiles import plan as planned
 from scanfind.tiles.plan import BASE_BYTES, ROW_BYTES, STATION_BYTES, Held, estimate, size_of, tiles_of
+from scanfind.tiles.sweep import enough, learnt_from
 from test_find import BRACKET, QUICK, Floats, clouds, library
 
 # A corridor of rooms, of which no tile may hold more than about one and a half.
@@ -186,6 +188,29 @@ def test_every_bin_has_one_tile_and_no_tile_too_much(seed: int, margin: int, mos
     np.testing.assert_array_equal(np.sum([tile.holds(bins) for tile in tiles], axis=0), 1)
     assert all(rows[tile.grown(margin).holds(bins)].sum() <= most for tile in tiles)
     assert tiles == tiles_of(Held(bins[::-1], rows[::-1], held.reached), margin, memory)
+
+
+def tally(tested: float, hits: float = 0.0, shown: float = 0.0) -> Tally:
+    return Tally(np.array([tested]), np.array([hits]), np.array([shown]))
+
+
+@given(st.lists(st.tuples(st.floats(1, 1e4), st.floats(1, 1e4)), min_size=1), st.floats(0, 1e5))
+def test_what_tiles_find_tells_how_long_others_are_searched(found: list[tuple[float, float]], tested: float) -> None:
+    tallies = [tally(0.0, hits, shown) for hits, shown in found]
+    (share,) = learnt = learnt_from([*tallies, tally(tested)])
+    assert 0.5 * min(h / s for h, s in found) <= share * (1 + 1e-9) <= 0.5 * max(h / s for h, s in found) * (1 + 2e-9)
+    assert all(enough(one, learnt, 0.01) for one in tallies)
+    assert enough(tally(tested), learnt, 0.01) == (np.exp(-share * tested) < 0.01)
+    assert enough(tally(np.inf), learnt, 0.01)
+    assert learnt_from([tally(tested)]) == (0.0,)
+    assert not enough(tally(np.inf), (0.0,), 0.01)
+
+
+def test_a_tile_searched_again_tells_the_same(narrow: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("scanfind.tiles.sweep.HOPED", 1e6)  # each but one round
+    monkeypatch.setattr("scanfind.tiles.sweep.enough", lambda *_: False)
+    assert_same(in_tiles(narrow, work=tmp_path), serial())
+    assert {path.name.replace("again-", "search-") for path in tmp_path.glob("again-*")} == set(TILES)
 
 
 def test_setups_whose_beams_come_into_a_tile_count() -> None:

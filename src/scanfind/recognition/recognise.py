@@ -105,15 +105,17 @@ class Recognition:
 
     def __init__(
         self, scene: Scene, models: Sequence[Model], table: JointTable, parameters: Parameters, seed: int, jobs: int,
-        standing: Sequence[Standing] = (),
+        standing: Sequence[Standing] = (), learnt: Sequence[float] = (),
     ) -> None:  # fmt: skip
         self.scene, self.models, self.parameters, self.jobs = scene, models, parameters, jobs
         self.arrays = model_arrays(models)
-        self.search = Search(scene, models, table, self.arrays, parameters.search, seed, jobs)
+        self.search = Search(scene, models, table, self.arrays, parameters.search, seed, jobs, learnt)
         fine, coarse = self.search.telling()
         inlier = parameters.verify.inlier_noises * scene.noise
         inliers = [inlier + parameters.verify.inlier_cells * level.cell for level in (scene.fine, scene.coarse)]
         self._lines: LineSearch | None = None
+        # What surface found elsewhere need not be looked for by lines here.
+        self._by_lines = np.array([not share for share in learnt or [0.0] * len(models)])
         self._seed = seed
         self._fine = Level(scene.fine, fine, ALL_SAMPLES, inliers[0])
         self._thin = Level(scene.coarse, coarse, ALL_SAMPLES, inliers[0])
@@ -153,7 +155,7 @@ class Recognition:
 
     def _untried(self) -> bool:
         """Are lines still to be asked?"""
-        return self.parameters.search.by_lines and self._lines is None
+        return self.parameters.search.by_lines and self._lines is None and bool(self._by_lines.any())
 
     def round(self) -> Hypotheses:
         """Hypotheses of one more round, best first: of pairs of surface; once, for models of which the first round of
@@ -161,7 +163,8 @@ class Recognition:
         """
         if self._untried() and (self.search.rounds or not self.search.pool_left()):
             found = np.isin(np.arange(len(self.models)), [candidate.model for candidate in self.believed])
-            self._lines = LineSearch(self.scene, self.models, ~found, self.parameters.search, self._seed, self.jobs)
+            wanted = self._by_lines & ~found
+            self._lines = LineSearch(self.scene, self.models, wanted, self.parameters.search, self._seed, self.jobs)
             if self._lines:
                 # What was refused for telling too little may be told by its lines.
                 again = [self._placements(c.model, [Pose(c.rotation, c.translation)]) for c, _ in self._refused]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import exp, log
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,6 +117,19 @@ class SearchParameters:
             require(getattr(self, name) >= 1, name, getattr(self, name), "1 or more")
 
 
+class Tally(NamedTuple):
+    """How the search for each of some models went, (models,).
+
+    tested : right pairs tested of an instance that shows λs of its surface, had there been one; inf where no pair is
+        left to draw
+    hits, shown : of the instances found: how often they were hit, and by how many right pairs
+    """
+
+    tested: Floats
+    hits: Floats
+    shown: Floats
+
+
 class Search:
     """The rounds of RANSAC over one scene, for all models together; the same seed gives the same rounds."""
 
@@ -124,7 +137,7 @@ class Search:
         self, scene: Scene, models: Sequence[Model], table: JointTable, arrays: ModelArrays,
         parameters: SearchParameters, seed: int, jobs: int, learnt: Sequence[float] = (),
     ) -> None:  # fmt: skip
-        """learnt : of each model, the share of right pairs that found it elsewhere; 0, or nothing: nobody knows."""
+        """Take a scene; learnt : of each model, the share of right pairs that found it elsewhere, 0: nobody knows."""
         self.scene, self.models, self.table, self.arrays = scene, models, table, arrays
         self.parameters, self.seed, self.jobs = parameters, seed, jobs
         self.pairs = models[0].parameters.pairs
@@ -240,6 +253,11 @@ class Search:
         """Chance to have missed an instance that shows λs of its surface, for the model worst served so far."""
         expected = np.where(self._learned[:, 1] > 0.0, self.effort * self._rate(), self._finds * self._right)
         return exp(-float(expected.min(initial=np.inf, where=~self._served)))
+
+    def tally(self) -> Tally:
+        """How the search has gone so far."""
+        tested = self._right if self.pool_left() else np.full(len(self.models), np.inf)
+        return Tally(tested, self._learned[:, 0], self._learned[:, 2])
 
     def _share(self) -> float:
         """The share of a full round that the next one needs be: as much as is missing."""

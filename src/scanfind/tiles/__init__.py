@@ -2,7 +2,8 @@
 
     sum up    each scan, once: its moments and beams, by bins, on disk      one task a scan
     cut       the site into tiles that fit the memory, from what bins hold
-    search    each tile with its margin, larger models first                one task a tile
+    search    each tile with its margin, larger models first; again where
+              other tiles tell that it was not enough                       one task a tile
     own       each instance once: by the tile that has its middle
     isolate   each scan, once more: the points of every instance            one task a scan
 
@@ -16,7 +17,7 @@ from __future__ import annotations
 import pickle
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -43,14 +44,13 @@ from scanfind.threads import available_cores
 from scanfind.tiles.listed import Listed, listed_of
 from scanfind.tiles.plan import (
     Held,
-    Tile,
     bin_blocks,
     estimate,
-    margin_bins,
-    tiles_of,
+    margin_of,
     words,
 )
 from scanfind.tiles.stored import parts_of, reached_from, stored_bins
+from scanfind.tiles.sweep import search_all
 from scanfind.tiles.tasks import (
     Cut,
     Found,
@@ -63,7 +63,6 @@ from scanfind.tiles.tasks import (
     gathered,
     on_disk,
     own,
-    search,
     sum_up,
     surface_of,
 )
@@ -73,6 +72,7 @@ if TYPE_CHECKING:
     from scanfind.detection import Detection, Refused
     from scanfind.library.model import Model
     from scanfind.progress import Progress
+    from scanfind.tiles.plan import Tile
 
 __all__ = ["find_in_tiles"]
 
@@ -189,7 +189,7 @@ def _find(
 
 def keep_memory(job: Job, sizes: Sizes, listed: Listed, say: Callable[[str], None]) -> None:
     """Say what the run will take; raise UsageError where the memory given is not enough for its smallest tile."""
-    groups = [(cell_of(job, size.models)[0], max(model.diameter for model in size.models)) for size in sizes.groups()]
+    groups = [(cell_of(job, size.models)[0], margin_of(size.models)) for size in sizes.groups()]
     needs = estimate(listed.infos(), groups, job.cell, job.bin_m())
     say(f"{needs.words()}; {words(job.memory)} a worker")
     if needs.least_memory > job.memory:
@@ -283,37 +283,7 @@ def held_by(job: Job, parts: list[Path], crew: Crew) -> Held:
     return Held(bins, rows, reached_from(parts) / job.bin_m())
 
 
-def search_all(
-    job: Job, group: int, models: list[Model], held: Held, summed: list[Summed],
-    folders: list[Path], standing: Sequence[Detection], searched: list[Searched], crew: Crew, tell: Progress,
-) -> dict[Tile, Searched]:  # fmt: skip
-    """What every tile of the site holds of the models of one size."""
-    _, levels = cell_of(job, models)
-    # A cell of a level above stands for four of a surface.
-    tiles = tiles_of(held._replace(rows=held.rows // 4**levels), margin_bins(models, job.bin_m()), job.memory)
-    taken = [Found(k, one.model, one.scene_from_model) for k, one in enumerate(standing)]
-    reach = 2.0 * max((one.reach for one in searched), default=0.0)
-    signed = all(one.signed for one in summed)
-    done = 0
-
-    def told(name: str, one: Searched) -> None:
-        nonlocal done
-        done += 1
-        tell("search", done, len(tiles))
-
-    def found(deeper: bool) -> dict[Tile, Searched]:
-        name = f"search-{group}-deeper" if deeper else f"search-{group}"
-        tasks = {
-            f"{name}-{tile.name()}": (search, job, group, tile, taken, reach, signed, folders, deeper) for tile in tiles
-        }
-        return dict(zip(tiles, all_done(job.folder, crew, tasks, told), strict=True))
-
-    # As in one piece: deeper where the whole site shows nothing, not where a tile does, and most tiles do.
-    first = found(deeper=False)
-    return first if any(one.detections for one in first.values()) else found(job.parameters.search.deeper)
-
-
-def typical(found: dict[Tile, Searched]) -> list[Searched]:
+def typical(found: Mapping[Tile, Searched]) -> list[Searched]:
     """Searches by how their noise ranks about its median among those that found something, nearest first."""
     with_some = [one for _, one in sorted(found.items()) if one.detections]
     middle = float(np.median([one.noise for one in with_some])) if with_some else 0.0
