@@ -214,7 +214,8 @@ def child(workers: int, memory: str, files: list[Path], *, dask: bool) -> None:
     own, theirs = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     print(
         json.dumps({
-            "points": sum(each.points for each in found.scans), "tiles": tiles, "again": again, "stored_mb": stored / 1e6,
+            "points": sum(each.points for each in found.scans), "tiles": tiles, "again": again,
+            "stored_mb": stored / 1e6,
             # Of workers the largest counts for each: they do the same.
             "peak_memory_mb": (own + workers * theirs) / 1024, "read_s": read_s, "search_s": search_s,
             "isolate_s": isolate_s, "find_s": took,
