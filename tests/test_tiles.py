@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pytest
@@ -109,8 +110,17 @@ def whole() -> Findings:
     return find(corridor(), library(), parameters=QUICK)
 
 
-def test_one_tile_is_find() -> None:
-    assert_same(find_in_tiles(clouds(), library(), parameters=QUICK), find(clouds(), library(), parameters=QUICK))
+NUMBERS: dict[str, np.dtype[Any]] = {"scan_id": np.dtype(np.int32), "source_index": np.dtype(np.int64)}
+
+
+def test_one_tile_is_find(tmp_path: Path) -> None:
+    scans = [replace(cloud, attributes={}) for cloud in clouds()]
+    with open_writer(tmp_path / "tile.ply", NUMBERS) as tile, open_writer(tmp_path / "find.ply", NUMBERS) as rest:
+        assert_same(
+            find_in_tiles(scans, library(), parameters=QUICK, remainder=tile),
+            find(scans, library(), parameters=QUICK, remainder=rest),
+        )
+    assert (tmp_path / "tile.ply").read_bytes() == (tmp_path / "find.ply").read_bytes()
 
 
 def test_tiles_are_the_whole() -> None:

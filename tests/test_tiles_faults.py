@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -21,7 +22,8 @@ import pytest
 from scanfind.cli import main
 from scanfind.errors import OutputError, UsageError
 from scanfind.pose import Pose
-from scanfind.scans import open_stations
+from scanfind.scans import open_stations, scan_info
+from scanfind.tiles.plan import size_of
 from scanfind.tiles.workers import cluster, processes
 from test_find import QUICK, library
 from test_tiles import assert_same, corridor, in_tiles, narrow, serial
@@ -184,9 +186,11 @@ def test_an_unreadable_setup_among_others_is_told_by_the_exit_code(
     shutil.copytree(setups, tmp_path / "site")
     damaged = tmp_path / "site" / "setups" / "setup9.e57"
     damaged.write_bytes((setups / "setups" / "setup1.e57").read_bytes()[:100_000])
-    assert main(command(tmp_path / "site", tmp_path / "found")) == 4
+    assert main(command(tmp_path / "site", tmp_path / "found", "--remainder")) == 4
     assert "setup9.e57 was left out" in capsys.readouterr().err
-    assert len(detections(tmp_path / "found")) == 3
+    isolated = sum(points for _, _, points in detections(tmp_path / "found"))
+    left = scan_info(tmp_path / "found" / "remainder.ply").points
+    assert isolated + left == sum(len(cloud) for cloud in corridor())
 
 
 @pytest.mark.slow
@@ -199,3 +203,45 @@ def test_a_dask_cluster_does_the_same_and_a_killed_worker_changes_nothing(tmp_pa
         found = in_tiles(narrow, cluster(local.scheduler_address), work=tmp_path / "work")
         killer.join()
     assert_same(found, serial())
+
+
+def dask_process(what: str, *options: str) -> subprocess.Popen[bytes]:
+    call = [sys.executable, "-m", f"distributed.cli.dask_{what}", *options, "--no-dashboard"]
+    return subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+@pytest.mark.slow
+def test_a_killed_scheduler_is_told_in_a_line_and_the_run_goes_on_without_it(tmp_path: Path, narrow: int) -> None:
+    pytest.importorskip("distributed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    address, work = f"tcp://127.0.0.1:{port}", tmp_path / "work"
+    with (
+        dask_process("scheduler", "--port", str(port)) as scheduler,
+        dask_process("worker", address, "--nthreads", "1", "--no-nanny") as worker,
+    ):
+        killer = threading.Thread(target=kill_once_searching, args=(work, lambda: scheduler.pid))
+        killer.start()
+        with pytest.raises(OutputError, match=r"gave up on a task \(its scheduler is gone\): give --resume"):
+            in_tiles(narrow, cluster(address), work=work)
+        killer.join()
+        worker.kill()
+    assert any(work.glob("scan-*/done"))
+    assert_same(in_tiles(narrow, work=work, resume=True), serial())
+
+
+@pytest.mark.slow
+def test_the_memory_given_is_kept(setups: Path, tmp_path: Path) -> None:
+    """Of the parent and its workers together, as the system counts it."""
+    measured = (
+        "import resource, sys; from scanfind.cli import main; code = main(sys.argv[1:]); "
+        "own, theirs = (resource.getrusage(of).ru_maxrss for of in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)); "
+        "print(code, own, theirs)"
+    )
+    call = [sys.executable, "-c", measured, *command(setups, tmp_path / "found", "--workers", "1")]
+    told = subprocess.run(call, capture_output=True, text=True, check=True).stdout.splitlines()[-1]
+    code, own, theirs = map(int, told.split())
+    assert code == 0
+    assert len(detections(tmp_path / "found")) == 3
+    assert 1024 * (own + theirs) < size_of("1200MB")

@@ -33,9 +33,7 @@ from scanfind.cloud import shift_for
 from scanfind.detection import Findings
 from scanfind.errors import Interrupted, UnreadableFileError, UnsupportedFormatError, UsageError
 from scanfind.find import ModelInput, isolation_tolerance, models_of
-from scanfind.fit.polish import polished
 from scanfind.grid.moments import MomentGrid
-from scanfind.isolation.deviation import deviation_of
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.recognition.sizes import Sizes
 from scanfind.results.document import fingerprint
@@ -49,22 +47,18 @@ from scanfind.tiles.plan import (
     margin_of,
     words,
 )
+from scanfind.tiles.points import isolate_all, write_remainder
 from scanfind.tiles.stored import parts_of, reached_from, stored_bins
 from scanfind.tiles.sweep import search_all
 from scanfind.tiles.tasks import (
-    Cut,
     Found,
     Job,
     Searched,
     Summed,
     cell_of,
     count,
-    cut,
-    gathered,
-    on_disk,
     own,
     sum_up,
-    surface_of,
 )
 from scanfind.tiles.work import Crew, Here, Workers, all_done, no_room, opened
 
@@ -72,6 +66,7 @@ if TYPE_CHECKING:
     from scanfind.detection import Detection, Refused
     from scanfind.library.model import Model
     from scanfind.progress import Progress
+    from scanfind.scans import CloudWriter
     from scanfind.tiles.plan import Tile
 
 __all__ = ["find_in_tiles"]
@@ -96,6 +91,7 @@ def find_in_tiles(
     units: str | None = None,
     select: Sequence[str] = (),
     progress: Progress | None = None,
+    remainder: CloudWriter | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Findings:
     """As `find`, for sites of any size: the same detections, to what a pose is sure by.
@@ -108,6 +104,7 @@ def find_in_tiles(
             detections are mapped from it. None: a temporary one
         resume : go on with what `work` holds
         jobs : threads of a worker
+        remainder : takes every point that belongs to no detection; this process reads all scans once more for it
         say : is told, in a line, what the run will take, and what became of each scan
         the rest as for `find`; `search.time_limit_s` is of each tile. Models are not fitted in parts.
     Returns the findings; scans that could not be read are named in its notes and have no points.
@@ -133,7 +130,7 @@ def find_in_tiles(
             crew = stack.enter_context(Crew(executor or Here()))
             return _find(
                 folder, listed, library, crew, memory, parameters, seed, jobs or available_cores(), clock, tell, say,
-                resume=resume or work is None,
+                remainder, resume=resume or work is None,
             )  # fmt: skip
         except KeyboardInterrupt as error:
             if work is None:
@@ -144,7 +141,8 @@ def find_in_tiles(
 
 def _find(
     folder: Path, listed: Listed, library: list[Model], crew: Crew, memory: int, parameters: Parameters,
-    seed: int, jobs: int, clock: Clock, tell: Progress, say: Callable[[str], None], *, resume: bool,
+    seed: int, jobs: int, clock: Clock, tell: Progress, say: Callable[[str], None], remainder: CloudWriter | None, *,
+    resume: bool,
 ) -> Findings:  # fmt: skip
     sizes = Sizes(library, parameters)
     cell = sizes.finest_cell()
@@ -171,12 +169,15 @@ def _find(
     findings[:] = numbered(findings, parameters.search.max_instances)
     findings.refused = closest(searched)
 
-    if findings:
-        with clock("isolate"):
-            one = largest or searched[-1]
-            tolerance = isolation_tolerance(parameters.isolate, one.noise, one.cell)
+    with clock("isolate"):
+        one = largest or searched[-1]
+        tolerance = isolation_tolerance(parameters.isolate, one.noise, one.cell)
+        placed = [Found(one.id, one.model, one.scene_from_model) for one in findings]
+        if findings:
             findings.tolerance_m = tolerance
-            findings[:] = isolate_all(job, listed, findings, tolerance, summed, crew, clock, tell)
+            findings[:] = isolate_all(job, listed, findings, placed, tolerance, summed, crew, clock, tell)
+        if remainder is not None:
+            write_remainder(job, listed, placed, tolerance, summed, remainder, tell)
     findings.scans, findings.crs = [one.told for one in summed], listed.crs()
     findings.missing = [f"{one.told.path} was left out: {one.missing}" for one in summed if one.missing]
     left_out = sum(one.unaddressable for one in summed)
@@ -305,38 +306,6 @@ def closest(searched: Sequence[Searched]) -> list[Refused]:
         if len(same) < REFUSED_SHOWN and all(np.linalg.norm(o.scene_from_model.translation - at) > 1e-3 for o in same):
             kept.append(one)
     return kept
-
-
-def isolate_all(
-    job: Job, listed: Listed, findings: Findings, tolerance: float, summed: list[Summed], crew: Crew,
-    clock: Clock, tell: Progress,
-) -> list[Detection]:  # fmt: skip
-    """Every detection with its raw points, on disk, and fitted to them."""
-    found = [Found(one.id, one.model, one.scene_from_model) for one in findings]
-    firsts = np.cumsum([0, *(one.scans for one in summed)]).tolist()
-    readable = [k for k, one in enumerate(summed) if not one.missing]
-    tasks = {f"cut-{k:05d}": (cut, job, listed.all[k].scan, k, found, tolerance, firsts[k]) for k in readable}
-    done, expected = 0, sum(one.told.points for one in summed)
-
-    def told(name: str, one: Cut) -> None:
-        nonlocal done
-        done += summed[int(name.rpartition("-")[2])].told.points
-        tell("isolate", done, expected)
-
-    cuts = list(zip([job.folder / name for name in tasks], all_done(job.folder, crew, tasks, told), strict=True))
-    measured = []
-    for one in findings:
-        cut_out = gathered(cuts, one.id)
-        with_points = one.with_points(cut_out, deviation_of(cut_out.deviation) if len(cut_out) else None)
-        with clock("refine"):
-            surface = surface_of(job.folder, one.model, tolerance)
-            fitted = polished(with_points, surface, job.parameters.refine, job.jobs)
-        points = fitted.isolated or cut_out
-        try:
-            measured.append(replace(fitted, isolated=on_disk(points, job.folder / f"points-{one.id:05d}")))
-        except OSError as error:
-            raise no_room(job.folder, error) from error
-    return measured
 
 
 def scan_name(number: int) -> str:

@@ -252,13 +252,18 @@ def own(searched: Mapping[Tile, Searched], job: Job) -> list[Detection]:
     return sorted((one for _, one in kept), key=lambda one: order[id(one)])
 
 
+def isolator_of(job: Job, found: Sequence[Found], tolerance: float) -> Isolator:
+    """What says of each raw point to which instance it belongs."""
+    placed = [Placed(one.id, surface_of(job.folder, one.model, tolerance), one.scene_from_model) for one in found]
+    return Isolator(placed, IsolateParameters(tolerance), jobs=job.jobs)
+
+
 def cut(folder: Path, job: Job, scan: Scan, number: int, found: Sequence[Found], tolerance: float, first: int) -> Cut:
     """Pass over a scan once more; the points of detections lie in the folder then, in the order of the file.
 
     first : the number of its first scan among all
     """
-    placed = [Placed(one.id, surface_of(job.folder, one.model, tolerance), one.scene_from_model) for one in found]
-    isolator = Isolator(placed, IsolateParameters(tolerance), jobs=job.jobs)
+    isolator = isolator_of(job, found, tolerance)
     source = source_of(scan, None if job.origin is None else np.array(job.origin), number)
     pieces: list[tuple[int, int, int, int]] = []
     dtypes: list[np.dtype[Any]] = []
