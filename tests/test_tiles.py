@@ -38,14 +38,14 @@ ROWS_A_TILE = 230_000
 
 
 @cache
-def corridor() -> list[PointCloud]:
+def corridor(rooms: int = ROOMS) -> list[PointCloud]:
     """Rooms with a bracket each, every third point of each station."""
     return [
         replace(
             cloud, xyz=cloud.xyz[::3] + k * APART, origin=None if cloud.origin is None else cloud.origin + k * APART,
             attributes={name: values[::3] for name, values in cloud.attributes.items()},
         )
-        for k in range(ROOMS)
+        for k in range(rooms)
         for cloud in clouds()
     ]  # fmt: skip
 
