@@ -24,7 +24,7 @@ from scanfind.find import find
 from scanfind.grid.moments import ROW, MomentGrid
 from scanfind.scans import open_writer, read_scan, scan_info
 from scanfind.scans.sources import scans_of
-from scanfind.search.surface import Tally
+from scanfind.search.surface import RIGHT_PAIR_FINDS, Tally
 from scanfind.tiles import find_in_tiles
 from scanfind.tiles import plan as planned
 from scanfind.tiles.plan import BASE_BYTES, ROW_BYTES, STATION_BYTES, Held, estimate, size_of, tiles_of
@@ -208,7 +208,9 @@ def tally(tested: float, hits: float = 0.0, shown: float = 0.0) -> Tally:
 def test_what_tiles_find_tells_how_long_others_are_searched(found: list[tuple[float, float]], tested: float) -> None:
     tallies = [tally(0.0, hits, shown) for hits, shown in found]
     (share,) = learnt = learnt_from([*tallies, tally(tested)])
-    assert 0.5 * min(h / s for h, s in found) <= share * (1 + 1e-9) <= 0.5 * max(h / s for h, s in found) * (1 + 2e-9)
+    shares = [0.5 * hits / shown for hits, shown in found]
+    assert share == pytest.approx(np.clip(share, min(shares), max(shares))) or share == RIGHT_PAIR_FINDS
+    assert share >= RIGHT_PAIR_FINDS
     assert all(enough(one, learnt, 0.01) for one in tallies)
     assert enough(tally(tested), learnt, 0.01) == (np.exp(-share * tested) < 0.01)
     assert enough(tally(np.inf), learnt, 0.01)

@@ -154,7 +154,7 @@ class Search:
         self.rounds, self.effort, self._last_share = 0, 0.0, 1.0
         self.pool = np.empty(0, np.intp)
         self._fill_pool()
-        self._finds = np.where(np.asarray(learnt) > 0.0, learnt, RIGHT_PAIR_FINDS) if len(learnt) else RIGHT_PAIR_FINDS
+        self._finds = np.maximum(RIGHT_PAIR_FINDS, learnt or 0.0)
         self._right, self._last_right = np.zeros(len(models)), np.zeros(len(models))
         self._served = np.zeros(len(models), np.bool_)  # models of which no further instance is wanted
         # Of the instances found: hits, and what they showed, in full rounds and in right pairs of one that shows λs.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scanfind.search.surface import LEARNT, Tally
+from scanfind.search.surface import LEARNT, RIGHT_PAIR_FINDS, Tally
 from scanfind.tiles.plan import Held, Tile, tiles_of
 from scanfind.tiles.tasks import Found, Job, Searched, cell_of, search
 from scanfind.tiles.work import Crew, all_done
@@ -71,9 +71,13 @@ def search_all(
 
 
 def learnt_from(tallies: Iterable[Tally]) -> tuple[float, ...]:
-    """How many of the right pairs found each model over all tiles, less what was easy about it; 0: nothing did."""
+    """How many of the right pairs found each model over all tiles, less what was easy about it; 0: nothing did.
+
+    Never fewer than are believed of a model that nobody saw: nothing is searched longer for having been seen.
+    """
     _, hits, shown = (np.sum(column, axis=0) for column in zip(*tallies, strict=True))
-    return tuple((LEARNT * hits / np.where(shown > 0.0, shown, np.inf)).tolist())
+    share = LEARNT * hits / np.maximum(shown, 1e-300)
+    return tuple(np.where(hits > 0.0, np.maximum(share, RIGHT_PAIR_FINDS), 0.0).tolist())
 
 
 def enough(tally: Tally, learnt: Sequence[float], allowed: float) -> bool:
