@@ -133,7 +133,7 @@ def installed(model: Model, placement: Placement, found: Detection, spoken: Spok
     turn = pose_error(stands, design, model.symmetry).rotation_rad
     off = off_by(model, model.samples.points, stands, design)
     if off > FAR_M:
-        _, there = status_at(spoken, model.exposed_area())
+        _, there = status_at(spoken, model.area)
         why = f"where it should be {there}; one of its shape stands {off:.2f} m off"
         return Element(placement, model.name, UNCERTAIN, found.id, (x, y, z), turn, off, *shares(spoken), why)
     why = f"found with score {found.score:.2f}: {found.coverage:.0%} of its surface lies on the scan"
@@ -171,7 +171,7 @@ def information_of(found: Detection, radius: float) -> Floats:
 
 def missed(model: Model, placement: Placement, spoken: Spoken | None) -> Element:
     """An element that was not found, and what its place in the design looks like."""
-    status, why = status_at(spoken, model.exposed_area())
+    status, why = status_at(spoken, model.area)
     return Element(placement, model.name, status, None, None, None, None, *shares(spoken), why)
 
 

@@ -14,6 +14,8 @@ from scanfind.library.surface import MAX_LEVELS, SHRINK, ModelSurface, SurfacePa
 FINEST, COARSEST = 1.0 / 250.0, 1.0 / 30.0
 POINTS_A_CELL = 4.0
 MIN_NEIGHBOURS = 5
+# A plane that meets a cube, anyhow turned, has this much of the cube's face in it on average: volume over mean width.
+AREA_OF_A_CELL = 2.0 / 3.0
 
 
 def resample(cloud: CloudModel) -> Surfels:
@@ -51,9 +53,9 @@ def sample_cloud(cloud: CloudModel, parameters: SurfaceParameters, seed: int = 0
     """
     from scanfind.kernels.sampling import poisson_order
 
-    surface, _ = oriented(cloud)
+    surface, cell = oriented(cloud)
     shuffled = np.random.default_rng(seed).permutation(len(surface))
     points, normals = surface.points[shuffled], surface.normals[shuffled]
     reach = float(np.linalg.norm(np.ptp(points, axis=0)))
     order, spacing = poisson_order(points, normals, parameters.samples, reach / 2.0, SHRINK, MAX_LEVELS)
-    return surface_of(OrientedCloud(points[order], normals[order], surface.signed), spacing)
+    return surface_of(OrientedCloud(points[order], normals[order], surface.signed), spacing, len(surface) * AREA_OF_A_CELL * cell**2)

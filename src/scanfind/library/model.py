@@ -21,8 +21,6 @@ from scanfind.symmetry import Symmetry, parse_axes
 
 # Part of every model's hash: raise it when the samples or pairs of one and the same model come out differently.
 RECIPE = "scanfind model, recipe 1"
-# Poisson disks jam at 0.56 of the plane, not at the 0.91 of a hexagonal packing: a sample stands for 1.4 spacing².
-AREA_OF_A_SAMPLE = 1.4
 
 
 @dataclass(frozen=True)
@@ -51,6 +49,7 @@ class Model:
     sha256 : hash of geometry and parameters; the name is no part of it
     diameter : the paper's ρ = diam(M), metres
     spacing : distance between neighbouring samples, metres
+    area : the surface a scanner could see, m²
     signed : the normals of the samples point outwards; False where nobody knows their side
     samples : (N,) oriented points a scanner could see, model frame, every prefix evenly spread
     mesh : the triangles, for isolation; None for a model that is a piece of scan
@@ -66,6 +65,7 @@ class Model:
     source: str
     diameter: float
     spacing: float
+    area: float
     signed: bool
     samples: OrientedCloud
     mesh: Mesh | None
@@ -78,11 +78,7 @@ class Model:
 
     def area_of_a_sample(self) -> float:
         """The surface a sample stands for, m²."""
-        return AREA_OF_A_SAMPLE * self.spacing**2
-
-    def exposed_area(self) -> float:
-        """The surface a scanner could see, m²."""
-        return self.area_of_a_sample() * len(self.samples)
+        return self.area / len(self.samples)
 
 
 class ModelSummary(NamedTuple):
@@ -134,6 +130,7 @@ def build_model(model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS
         source=model.source,
         diameter=surface.diameter,
         spacing=surface.spacing,
+        area=surface.area,
         signed=surface.signed,
         samples=surface.samples,
         mesh=mesh,

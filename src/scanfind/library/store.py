@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scanfind.errors import LibraryError
 
 APPLICATION_ID = 0x53434644  # "SCFD": what tells our file from other people's SQLite files
-VERSION = 2  # a record says how a model resembles itself
+VERSION = 3  # a record says how large a surface is
 # `content` holds the sum of the records' CRCs: a damaged page may take its rows with it without a word.
 SCHEMA = (
     "CREATE TABLE records (sha256 TEXT PRIMARY KEY, name TEXT NOT NULL UNIQUE, facts TEXT, crc INTEGER)",

@@ -71,12 +71,14 @@ class ModelSurface:
     samples : (N,) points and unit normals, model frame, metres; every prefix is itself evenly spread
     spacing : no two samples are closer, unless their normals are more than 120° apart (a thin plate), metres
     diameter : the largest distance between two samples, the paper's ρ = diam(M), metres
+    area : what they stand for, both sides of a sheet, m²
     signed : the normals point outwards; False where nobody knows their side
     """
 
     samples: OrientedCloud
     spacing: float
     diameter: float
+    area: float
     signed: bool
 
 
@@ -89,26 +91,29 @@ def sample_mesh(mesh: Mesh, parameters: SurfaceParameters, seed: int = 0) -> Mod
     from scanfind.kernels.sampling import poisson_order
 
     rng = np.random.default_rng(seed)
-    candidates = _visible_candidates(mesh, parameters, rng)
+    candidates, area = _visible_candidates(mesh, parameters, rng)
     reach = float(np.linalg.norm(np.ptp(candidates.points, axis=0)))
     order, spacing = poisson_order(
         candidates.points, candidates.normals, parameters.samples, reach / 2.0, SHRINK, MAX_LEVELS
     )
-    return surface_of(OrientedCloud(candidates.points[order], candidates.normals[order]), spacing)
+    return surface_of(OrientedCloud(candidates.points[order], candidates.normals[order]), spacing, area)
 
 
-def surface_of(samples: OrientedCloud, spacing: float) -> ModelSurface:
+def surface_of(samples: OrientedCloud, spacing: float, area: float) -> ModelSurface:
     """Samples with their diameter, which is exact: all pairs are tried."""
     from scanfind.kernels.sampling import largest_distance
 
-    return ModelSurface(samples, float(spacing), float(largest_distance(samples.points)), samples.signed)
+    return ModelSurface(samples, float(spacing), float(largest_distance(samples.points)), area, samples.signed)
 
 
-def _visible_candidates(mesh: Mesh, parameters: SurfaceParameters, rng: np.random.Generator) -> OrientedCloud:
-    """Random points of the visible surface, in random order, several for each sample wanted."""
+def _visible_candidates(
+    mesh: Mesh, parameters: SurfaceParameters, rng: np.random.Generator
+) -> tuple[OrientedCloud, float]:
+    """Random points of the visible surface, in random order, several for each sample wanted; and its area, m²."""
     sight = _Sight(mesh, parameters.directions)
-    points, normals, found = [], [], 0
+    points, normals, found, thrown = [], [], 0, 0
     for _ in range(MAX_ROUNDS):
+        thrown += DARTS_PER_SAMPLE * parameters.samples
         p, n = random_points(mesh, DARTS_PER_SAMPLE * parameters.samples, rng)
         # Where both sides may be seen it need not be told by how much, which spares half of the rays.
         enough = parameters.min_visible if parameters.two_sided else 1.0
@@ -128,7 +133,7 @@ def _visible_candidates(mesh: Mesh, parameters: SurfaceParameters, rng: np.rando
         msg = f"nothing of mesh {mesh.name!r} can be seen from outside; lower min_visible ({parameters.min_visible})"
         raise InvalidGeometryError(msg)
     order = rng.permutation(found)
-    return OrientedCloud(np.concatenate(points)[order], np.concatenate(normals)[order])
+    return OrientedCloud(np.concatenate(points)[order], np.concatenate(normals)[order]), mesh.area() * found / thrown
 
 
 def random_points(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:

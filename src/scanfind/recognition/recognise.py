@@ -15,6 +15,7 @@ from scanfind.design.elements import LEAST_LOOKED_AT, Element, elements_of, plac
 from scanfind.detection import Detection, Motion, Refused
 from scanfind.evidence.free_space import Limits, Spoken, caster_of, spoken_of, towards
 from scanfind.evidence.verify import (
+    ROUGHLY_KNOWN,
     Evidence,
     Level,
     distances,
@@ -335,7 +336,8 @@ class Recognition:
         found = []
         for seen, on_lines, number, rotation, translation in zip(support, lines, *hypotheses[:3], strict=True):
             spoken = self._spoken_of(int(number), Pose(rotation, translation))
-            found.append(Evidence(*seen[:-1], spoken, seen.claims, float(on_lines)))
+            against = ROUGHLY_KNOWN if self.models[number].mesh is None else 1.0
+            found.append(Evidence(*seen[:-1], spoken, seen.claims, float(on_lines), against))
         return found
 
     def _spoken_of(self, number: int, placed: Pose) -> Spoken:
@@ -379,7 +381,7 @@ class Recognition:
     def _why_not_in_place(self, candidate: Candidate) -> str:
         """Why an element is not believed to stand where the design puts it; empty where it is."""
         on, beside, through, _ = candidate.evidence.spoken
-        enough = LEAST_LOOKED_AT * self.models[candidate.model].exposed_area()
+        enough = LEAST_LOOKED_AT * self.models[candidate.model].area
         if not self.blind and on + beside + through < enough:
             return "scanners looked at too little of it to be sure"
         return why_refused(candidate.evidence, self.blind, self.parameters.verify, in_place=True)
@@ -457,7 +459,7 @@ class Recognition:
             if whole is None or whole.reason:
                 continue
             net = whole.evidence.telling - NET_PENALTY * whole.evidence.penalty()
-            area = net * self.models[model].exposed_area()
+            area = net * self.models[model].area
             found.append(
                 candidate._replace(
                     rotation=whole.pose.rotation, translation=whole.pose.translation, evidence=whole.evidence,

@@ -35,6 +35,9 @@ ROUNDS_A_POOL = 4  # draw from mostly the same cells, which are fitted then; sma
 FIRST_ROUND, ROUND_MARGIN, LEAST_ROUND, MOST_ROUND = 0.3, 1.1, 0.15, 1.3
 # With so many scanner positions nearly every sample faces one, and asking costs more than it tells.
 FACING_ORIGINS = 6
+# Of the samples that show, so many lie on the scene under a right hypothesis: noise turns normals and moves it. Asked
+# for all of λs, the test refused every right pose of twelve parts that showed 30 %; asked for this, none.
+MEETS = 0.67
 SHAPED = 1000  # samples whose shape tells that of a model, each against all of them
 # Borders between classes of bend, in shares of the window: range noise of 2 mm on a plane is below the first for
 # windows over 0.1 m, a pipe as wide as the window above the last.
@@ -165,8 +168,10 @@ class Search:
         """Look for instances that show this share of their surface, and more."""
         self._shown, self._until, chance = overlap_ratio, 0.0, self.parameters.chance_overlap
         # A right hypothesis puts so many of its samples on the scene, and chance some of the others.
-        right = overlap_ratio + (1.0 - overlap_ratio) * chance
-        self._least_hits = wald_table(self.parameters.tests, right, chance)
+        self._least_hits, self._least_hits_at_first = (
+            wald_table(self.parameters.tests, shown + (1.0 - shown) * chance, chance)
+            for shown in (MEETS * overlap_ratio, overlap_ratio)
+        )
 
     def look_deeper(self) -> bool:
         """Look for instances that show half of λs for some rounds; False where that is done already."""
@@ -294,9 +299,9 @@ class Search:
         most = share * limits.hypotheses_a_round * self._draws.sides
         tested = affordable(drawn, self.table, most, rarest_first=limits.telling_first)
         self._expect(count, drawn.keys, tested.keys)
-        trial = Trial(
-            self.table, self.arrays, self.scene.tolerant, self._origins, self._least_hits, limits.normal_length_m
-        )
+        # The first round finds what is easily seen, in half of the time.
+        least = self._least_hits if self.rounds else self._least_hits_at_first
+        trial = Trial(self.table, self.arrays, self.scene.tolerant, self._origins, least, limits.normal_length_m)
         self.rounds += 1
         self.effort += share
         self._last_share = share
@@ -315,7 +320,7 @@ class Search:
         for number, model in enumerate(self.models):
             samples, rung_of_pair = len(model.samples), model.pairs.keys // self.pairs.cells_per_rung()
             # What of an instance that shows λs of its surface would be in the pool.
-            on_it = shown * model.exposed_area() / fine.cell**2 * float((self.model_shapes[number] * self._kept).sum())
+            on_it = shown * model.area / fine.cell**2 * float((self.model_shapes[number] * self._kept).sum())
             first_on_it = min(1.0, on_it / max(len(self.pool), 1))
             for rung in rungs_of(model.diameter, model.parameters.pairs):
                 keys = model.pairs.keys[rung_of_pair == rung]
