@@ -52,6 +52,7 @@ class Row:
     memory_mb: float
     peak_memory_mb: float
     tiles: int
+    again: int
     stored_mb: float
     read_s: float
     search_s: float
@@ -66,7 +67,7 @@ class Row:
 
 def main(
     shops: str = "1,4", points: float = 10e6, kind: str = "e57", workers: str = "0", memory: str = "3GB",
-    folder: Path | None = None, date: str = "", *, library: bool = True, dask: bool = False,
+    folder: Path | None = None, date: str = "", *, library: bool = True, dask: bool = False, each: bool = False,
 ) -> None:  # fmt: skip
     """Make a site, search parts of it of several sizes in tiles, each in a process of its own.
 
@@ -78,6 +79,7 @@ def main(
     :param folder: where the site lies or is made; a temporary one unless given.
     :param date: written to the CSV.
     :param dask: workers are those of a local dask cluster.
+    :param each: the memory is of each worker, so that any number of them searches the same tiles.
     :param library: also read each size twice with the file library alone.
     """
     rows = []
@@ -89,7 +91,8 @@ def main(
             files = [file_of(where, k, kind) for k in range(count)]
             alone_s = 2.0 * timed_read(files) if library else float("nan")
             for crew in workers.split(","):
-                rows.append(row := measured(files, kind, int(crew), memory, truth[:count], alone_s, dask))
+                of_all = f"{size_of(memory) * (max(int(crew), 1) if each else 1)}"
+                rows.append(row := measured(files, kind, int(crew), of_all, truth[:count], alone_s, dask))
                 print(row, flush=True)
     lines = summary(rows)
     tell(lines, write_csv(f"scale_{kind}", rows, ",".join(map(str, SEEDS)), date, lines))
@@ -203,7 +206,7 @@ def child(workers: int, memory: str, files: list[Path], *, dask: bool) -> None:
             say=lambda line: print(line, file=sys.stderr, flush=True),
         )  # fmt: skip
         took = time.perf_counter() - start
-        tiles = sum(1 for _ in Path(work).glob("search-*"))
+        tiles, again = (sum(1 for _ in Path(work).glob(f"{name}-*")) for name in ("search", "again"))
         stored = sum(path.stat().st_size for path in Path(work).glob("scan-*/**/*") if path.is_file())
     # Each stage's last word is its end.
     ends = [began.get(stage, 0.0) for stage in ("read", "search", "isolate")]
@@ -211,7 +214,8 @@ def child(workers: int, memory: str, files: list[Path], *, dask: bool) -> None:
     own, theirs = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     print(
         json.dumps({
-            "points": sum(each.points for each in found.scans), "tiles": tiles, "stored_mb": stored / 1e6,
+            "points": sum(each.points for each in found.scans), "tiles": tiles, "again": again,
+            "stored_mb": stored / 1e6,
             # Of workers the largest counts for each: they do the same.
             "peak_memory_mb": (own + workers * theirs) / 1024, "read_s": read_s, "search_s": search_s,
             "isolate_s": isolate_s, "find_s": took,
@@ -221,11 +225,13 @@ def child(workers: int, memory: str, files: list[Path], *, dask: bool) -> None:
 
 
 def summary(rows: list[Row]) -> list[str]:
-    """Each size in a line."""
+    """Each size in a line, and how much faster more workers were than one."""
+    one = {row.shops: row.find_s for row in rows if row.workers == 1}
     return [
         f"{row.points / 1e6:.0f} M points, {row.workers or 'no'} workers: {row.found} of {row.shops} found, "
         f"{row.false} false; {row.find_s:.0f} s, {row.ns_a_point:.0f} ns a point, {row.ratio:.2f} x reading twice; "
-        f"peak {row.peak_memory_mb:.0f} of {row.memory_mb:.0f} MB; {row.tiles} tiles"
+        f"peak {row.peak_memory_mb:.0f} of {row.memory_mb:.0f} MB; {row.tiles} tiles, {row.again} again"
+        + (f"; {one[row.shops] / row.find_s:.2f} x as fast as one" if row.workers > 1 and row.shops in one else "")
         for row in rows
     ]
 

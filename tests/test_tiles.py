@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,9 +24,11 @@ from scanfind.find import find
 from scanfind.grid.moments import ROW, MomentGrid
 from scanfind.scans import open_writer, read_scan, scan_info
 from scanfind.scans.sources import scans_of
+from scanfind.search.surface import RIGHT_PAIR_FINDS, Tally
 from scanfind.tiles import find_in_tiles
 from scanfind.tiles import plan as planned
 from scanfind.tiles.plan import BASE_BYTES, ROW_BYTES, STATION_BYTES, Held, estimate, size_of, tiles_of
+from scanfind.tiles.sweep import enough, learnt_from
 from test_find import BRACKET, QUICK, Floats, clouds, library
 
 # A corridor of rooms, of which no tile may hold more than about one and a half.
@@ -35,14 +38,14 @@ ROWS_A_TILE = 230_000
 
 
 @cache
-def corridor() -> list[PointCloud]:
+def corridor(rooms: int = ROOMS) -> list[PointCloud]:
     """Rooms with a bracket each, every third point of each station."""
     return [
         replace(
             cloud, xyz=cloud.xyz[::3] + k * APART, origin=None if cloud.origin is None else cloud.origin + k * APART,
             attributes={name: values[::3] for name, values in cloud.attributes.items()},
         )
-        for k in range(ROOMS)
+        for k in range(rooms)
         for cloud in clouds()
     ]  # fmt: skip
 
@@ -107,8 +110,17 @@ def whole() -> Findings:
     return find(corridor(), library(), parameters=QUICK)
 
 
-def test_one_tile_is_find() -> None:
-    assert_same(find_in_tiles(clouds(), library(), parameters=QUICK), find(clouds(), library(), parameters=QUICK))
+NUMBERS: dict[str, np.dtype[Any]] = {"scan_id": np.dtype(np.int32), "source_index": np.dtype(np.int64)}
+
+
+def test_one_tile_is_find(tmp_path: Path) -> None:
+    scans = [replace(cloud, attributes={}) for cloud in clouds()]
+    with open_writer(tmp_path / "tile.ply", NUMBERS) as tile, open_writer(tmp_path / "find.ply", NUMBERS) as rest:
+        assert_same(
+            find_in_tiles(scans, library(), parameters=QUICK, remainder=tile),
+            find(scans, library(), parameters=QUICK, remainder=rest),
+        )
+    assert (tmp_path / "tile.ply").read_bytes() == (tmp_path / "find.ply").read_bytes()
 
 
 def test_tiles_are_the_whole() -> None:
@@ -186,6 +198,31 @@ def test_every_bin_has_one_tile_and_no_tile_too_much(seed: int, margin: int, mos
     np.testing.assert_array_equal(np.sum([tile.holds(bins) for tile in tiles], axis=0), 1)
     assert all(rows[tile.grown(margin).holds(bins)].sum() <= most for tile in tiles)
     assert tiles == tiles_of(Held(bins[::-1], rows[::-1], held.reached), margin, memory)
+
+
+def tally(tested: float, hits: float = 0.0, shown: float = 0.0) -> Tally:
+    return Tally(np.array([tested]), np.array([hits]), np.array([shown]))
+
+
+@given(st.lists(st.tuples(st.floats(1, 1e4), st.floats(1, 1e4)), min_size=1), st.floats(0, 1e5))
+def test_what_tiles_find_tells_how_long_others_are_searched(found: list[tuple[float, float]], tested: float) -> None:
+    tallies = [tally(0.0, hits, shown) for hits, shown in found]
+    (share,) = learnt = learnt_from([*tallies, tally(tested)])
+    shares = [0.5 * hits / shown for hits, shown in found]
+    assert share == pytest.approx(np.clip(share, min(shares), max(shares))) or share == RIGHT_PAIR_FINDS
+    assert share >= RIGHT_PAIR_FINDS
+    assert all(enough(one, learnt, 0.01) for one in tallies)
+    assert enough(tally(tested), learnt, 0.01) == (np.exp(-share * tested) < 0.01)
+    assert enough(tally(np.inf), learnt, 0.01)
+    assert learnt_from([tally(tested)]) == (0.0,)
+    assert not enough(tally(np.inf), (0.0,), 0.01)
+
+
+def test_a_tile_searched_again_tells_the_same(narrow: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("scanfind.tiles.sweep.HOPED", 1e6)  # each but one round
+    monkeypatch.setattr("scanfind.tiles.sweep.enough", lambda *_: False)
+    assert_same(in_tiles(narrow, work=tmp_path), serial())
+    assert {path.name.replace("again-", "search-") for path in tmp_path.glob("again-*")} == set(TILES)
 
 
 def test_setups_whose_beams_come_into_a_tile_count() -> None:

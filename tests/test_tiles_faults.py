@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
@@ -19,15 +21,18 @@ import numpy as np
 import pytest
 
 from scanfind.cli import main
+from scanfind.cloud import PointCloud
 from scanfind.errors import OutputError, UsageError
 from scanfind.pose import Pose
-from scanfind.scans import open_stations
+from scanfind.scans import open_stations, scan_info
+from scanfind.tiles.plan import size_of
 from scanfind.tiles.workers import cluster, processes
 from test_find import QUICK, library
 from test_tiles import assert_same, corridor, in_tiles, narrow, serial
 
 __all__ = ["narrow"]
 DEADLINE_S = 120.0
+LONG = 8  # rooms of a corridor that is 1.2 GB in one piece
 
 
 class Enough(Exception):  # noqa: N818
@@ -115,18 +120,22 @@ def test_a_full_disk_is_one_line_and_no_end(small_disk: Path, narrow: int) -> No
     assert_same(in_tiles(narrow, work=work, resume=True), serial())
 
 
+def write_setups(folder: Path, clouds: Sequence[PointCloud]) -> None:
+    folder.mkdir()
+    for k, cloud in enumerate(clouds):
+        assert cloud.origin is not None
+        with open_stations(folder / f"setup{k}.e57", {}) as writer:
+            writer.station(f"setup{k}", Pose(np.eye(3), cloud.origin), (1, 1))
+            writer.write(cloud.xyz, {})
+
+
 @pytest.fixture(scope="module")
 def setups(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The corridor as a folder of E57 files, one a station, and the models as a library."""
     from scanfind.library import ModelLibrary
 
     folder = tmp_path_factory.mktemp("site")
-    (folder / "setups").mkdir()
-    for k, cloud in enumerate(corridor()):
-        assert cloud.origin is not None
-        with open_stations(folder / "setups" / f"setup{k}.e57", {}) as writer:
-            writer.station(f"setup{k}", Pose(np.eye(3), cloud.origin), (1, 1))
-            writer.write(cloud.xyz, {})
+    write_setups(folder / "setups", corridor())
     with ModelLibrary.open(folder / "parts.scanfind", create=True) as kept:
         for model in library().models():
             kept.put(model)
@@ -143,9 +152,9 @@ def command(setups: Path, out: Path, *more: str) -> list[str]:
             str(setups / "quick.toml"), "--memory", "1200MB", "--out", str(out), *more]  # fmt: skip
 
 
-def detections(out: Path) -> list[Any]:
+def detections(out: Path, expected: int = 3) -> list[Any]:
     found = json.loads((out / "results.json").read_text())["detections"]
-    assert len(found) == 3
+    assert len(found) == expected
     return sorted(([one["model"], one["scene_from_model"], one["points"]] for one in found), key=str)
 
 
@@ -184,9 +193,11 @@ def test_an_unreadable_setup_among_others_is_told_by_the_exit_code(
     shutil.copytree(setups, tmp_path / "site")
     damaged = tmp_path / "site" / "setups" / "setup9.e57"
     damaged.write_bytes((setups / "setups" / "setup1.e57").read_bytes()[:100_000])
-    assert main(command(tmp_path / "site", tmp_path / "found")) == 4
+    assert main(command(tmp_path / "site", tmp_path / "found", "--remainder")) == 4
     assert "setup9.e57 was left out" in capsys.readouterr().err
-    assert len(detections(tmp_path / "found")) == 3
+    isolated = sum(points for _, _, points in detections(tmp_path / "found"))
+    left = scan_info(tmp_path / "found" / "remainder.ply").points
+    assert isolated + left == sum(len(cloud) for cloud in corridor())
 
 
 @pytest.mark.slow
@@ -199,3 +210,51 @@ def test_a_dask_cluster_does_the_same_and_a_killed_worker_changes_nothing(tmp_pa
         found = in_tiles(narrow, cluster(local.scheduler_address), work=tmp_path / "work")
         killer.join()
     assert_same(found, serial())
+
+
+def dask_process(what: str, *options: str) -> subprocess.Popen[bytes]:
+    call = [sys.executable, "-m", f"distributed.cli.dask_{what}", *options, "--no-dashboard"]
+    return subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+@pytest.mark.slow
+def test_a_killed_scheduler_is_told_in_a_line_and_the_run_goes_on_without_it(tmp_path: Path, narrow: int) -> None:
+    pytest.importorskip("distributed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    address, work = f"tcp://127.0.0.1:{port}", tmp_path / "work"
+    with (
+        dask_process("scheduler", "--port", str(port)) as scheduler,
+        dask_process("worker", address, "--nthreads", "1", "--no-nanny") as worker,
+    ):
+        killer = threading.Thread(target=kill_once_searching, args=(work, lambda: scheduler.pid))
+        killer.start()
+        with pytest.raises(OutputError, match=r"gave up on a task \(its scheduler is gone\): give --resume"):
+            in_tiles(narrow, cluster(address), work=work)
+        killer.join()
+        worker.kill()
+    assert any(work.glob("scan-*/done"))
+    assert_same(in_tiles(narrow, work=work, resume=True), serial())
+
+
+@pytest.mark.slow
+def test_the_memory_given_is_kept(setups: Path, tmp_path: Path) -> None:
+    """By a worker, as the system counts it, on a site that is more than the memory holds at once."""
+    memory = "700MB"
+    write_setups(tmp_path / "setups", corridor(LONG))
+    searched = (
+        "import resource, sys; from scanfind.cli import main; code = main(sys.argv[1:]); "
+        "print(code, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
+    )
+    call = [
+        sys.executable, "-c", searched, "find", str(tmp_path / "setups"), "--library", str(setups / "parts.scanfind"),
+        "--config", str(setups / "quick.toml"), "--memory", memory, "--workers", "1", "--out", str(tmp_path / "found"),
+    ]  # fmt: skip
+    ended = subprocess.run(call, capture_output=True, text=True, check=True)
+    code, peak = map(int, ended.stdout.splitlines()[-1].split())
+    whole = re.search(r"up to (\S+ \S+) to be one tile", ended.stderr)
+    assert code == 0
+    assert whole is not None
+    assert size_of(whole[1]) > size_of(memory) > 1024 * peak
+    detections(tmp_path / "found", LONG)

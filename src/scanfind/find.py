@@ -158,18 +158,19 @@ def find(
 
 def recognise(
     size: Size, grid: MomentGrid, standing: Sequence[Standing], parameters: Parameters, seed: int, jobs: int,
-    clock: Clock, tell: Progress, *, at_design: bool, design: Design | None = None,
+    clock: Clock, tell: Progress, *, at_design: bool, design: Design | None = None, learnt: Sequence[float] = (),
 ) -> Recognition:  # fmt: skip
     """The search for models of one size: what is believed of them, and why (paper 3.3 and 3.4).
 
     standing : instances of larger models; at_design : try them where the design has them first; design : all of it
+    learnt : of each model, how many of the right pairs found it in other parts of the site, see Search
     """
     with clock("grid"):
         smallest = min(model.diameter for model in size.models)
         scene = build_scene(grid, smallest, parameters.grid, parameters.search.test_cells_across, jobs)
     with clock("library"):
         table = joint_table(size.models, each_once=parameters.search.each_once)
-    found = Recognition(scene, size.models, table, parameters, seed, jobs, standing, design)
+    found = Recognition(scene, size.models, table, parameters, seed, jobs, standing, design, learnt)
     for hypotheses in found.at_design() if at_design else ():
         with clock("refine"):
             poses = found.refine_in_place(hypotheses)

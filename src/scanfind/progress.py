@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 Progress = Callable[[str, float, float], None]
 
 # The stages that count points, and so have a rate a person can compare with the file's size.
-COUNTS_POINTS = ("read", "isolate", "write")
+COUNTS_POINTS = ("read", "isolate", "remainder", "write")
 
 COMPILE_STAGE = "compile"  # its total is how many seconds compiling is expected to take
 

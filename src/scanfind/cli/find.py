@@ -171,26 +171,28 @@ def find(
     flags = {
         "preset": preset, "seed": seed, "jobs": jobs, "units": units, "origin": origin, "format": format,
         "select": select, "search.max_instances": max_instances, "search.time_limit_s": time_limit,
-        "verify.min_score": min_score, "isolate.tolerance_m": tolerance, "isolate.dimensions": dimensions or None, "assembly.parts": parts or None,
+        "verify.min_score": min_score, "isolate.tolerance_m": tolerance,
+        "isolate.dimensions": dimensions or None, "assembly.parts": parts or None,
         "priors.region": region, "priors.up": up, "priors.model_up": model_up, "priors.tilt_deg": tilt,
         "priors.near_design_m": near_design, "priors.turned_deg": turned, "priors.expect": expected(expect),
     }  # fmt: skip
     run, parameters = load_settings(PRESETS, flags, config)
     files = [Path(file) for scan in scans for file in files_of(scan)]
-    tiled = Tiled.asked(memory, workers, scheduler, out, resume=resume, remainder=remainder)
+    tiled = Tiled.asked(memory, workers, scheduler, out, resume=resume)
     with ExitStack() as stack:
         folder = None if out is None else stack.enter_context(result_folder(out, overwrite=overwrite))
         models = stack.enter_context(open_models(model or [], library, run, parameters))
         progress = stack.enter_context(progress_on())
         rest = folder / f"remainder.{run.format}" if folder is not None and remainder else None
-        sink = None if rest is None else stack.enter_context(open_remainder(rest, files))
+        readable = files if tiled is None else tiled.readable(files)
+        sink = None if rest is None else stack.enter_context(open_remainder(rest, readable))
         if tiled is None:
             findings = find_models(
                 files, models, parameters=parameters, seed=run.seed, jobs=run.jobs, origin=run.origin,
                 progress=progress, remainder=sink,
             )  # fmt: skip
         else:
-            findings = tiled.find(files, models, run, parameters, progress)
+            findings = tiled.find(files, models, run, parameters, progress, sink)
         results = results_of(findings, folder, models, run, parameters, progress, remainder=rest.name if rest else None)
     if tiled is not None:
         tiled.finished()

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from scanfind.library import ModelLibrary
     from scanfind.parameters import Parameters
     from scanfind.progress import Progress
+    from scanfind.scans import CloudWriter
 
 
 class Tiled(NamedTuple):
@@ -33,8 +34,7 @@ class Tiled(NamedTuple):
 
     @staticmethod
     def asked(
-        memory: str | None, workers: int | None, scheduler: str | None, out: Path | None, *, resume: bool,
-        remainder: bool,
+        memory: str | None, workers: int | None, scheduler: str | None, out: Path | None, *, resume: bool
     ) -> Tiled | None:  # fmt: skip
         """From the options; None where none asks for tiles. Raises UsageError."""
         if memory is None and workers is None and scheduler is None and not resume:
@@ -44,9 +44,6 @@ class Tiled(NamedTuple):
             raise UsageError(msg)
         if workers is not None and workers < 1:
             msg = f"find: --workers is 1 or more, got {workers}"
-            raise UsageError(msg)
-        if remainder:
-            msg = "find: --remainder is not written by a search in tiles: leave it out, or search without them"
             raise UsageError(msg)
         if resume and out is None:
             msg = "find: --resume has nothing to go on with: give the --out DIR the search began with"
@@ -58,9 +55,16 @@ class Tiled(NamedTuple):
         work = None if out is None else out.absolute().with_name(f"{out.absolute().name}.scanfind-work")
         return Tiled(of_each, workers, scheduler, work, resume)
 
+    def readable(self, scans: Sequence[Path]) -> list[Path]:
+        """Those whose headers can be read: the others are left out, and told of when the search comes to them."""
+        from scanfind.tiles.listed import info_of
+
+        return [scan for number, scan in enumerate(scans) if info_of(scan, number) is not None]
+
     def find(
-        self, scans: Sequence[Path], models: ModelLibrary, run: Run, parameters: Parameters, progress: Progress
-    ) -> Findings:
+        self, scans: Sequence[Path], models: ModelLibrary, run: Run, parameters: Parameters, progress: Progress,
+        remainder: CloudWriter | None,
+    ) -> Findings:  # fmt: skip
         """Search."""
         from multiprocessing import active_children
 
@@ -77,7 +81,7 @@ class Tiled(NamedTuple):
             return find_in_tiles(
                 scans, models, executor=executor, memory=self.memory, work=self.work, resume=self.resume,
                 parameters=parameters, seed=run.seed, jobs=run.jobs or max(1, available_cores() // (self.workers or 1)),
-                origin=run.origin, progress=progress, say=note,
+                origin=run.origin, progress=progress, remainder=remainder, say=note,
             )  # fmt: skip
         except (Interrupted, KeyboardInterrupt):
             # Else Python waits for what workers are at, a minute or more.

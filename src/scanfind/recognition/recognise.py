@@ -117,15 +117,19 @@ class Recognition:
 
     def __init__(
         self, scene: Scene, models: Sequence[Model], table: JointTable, parameters: Parameters, seed: int, jobs: int,
-        standing: Sequence[Standing] = (), design: Design | None = None,
+        standing: Sequence[Standing] = (), design: Design | None = None, learnt: Sequence[float] = (),
     ) -> None:  # fmt: skip
         self.scene, self.models, self.parameters, self.jobs = scene, models, parameters, jobs
         self.arrays = model_arrays(models)
-        self.search = Search(scene, models, table, self.arrays, parameters.search, seed, jobs, parameters.priors)
+        self.search = Search(
+            scene, models, table, self.arrays, parameters.search, seed, jobs, learnt, parameters.priors
+        )
         fine, coarse = self.search.telling()
         inlier = parameters.verify.inlier_noises * scene.noise
         inliers = [inlier + parameters.verify.inlier_cells * level.cell for level in (scene.fine, scene.coarse)]
         self._lines: LineSearch | None = None
+        # What surface found elsewhere need not be looked for by lines here.
+        self._by_lines = np.array([not share for share in learnt or [0.0] * len(models)])
         self._seed = seed
         self._fine = Level(scene.fine, fine, ALL_SAMPLES, inliers[0])
         self._thin = Level(scene.coarse, coarse, ALL_SAMPLES, inliers[0])
@@ -185,15 +189,19 @@ class Recognition:
 
     def _untried(self) -> bool:
         """Are lines still to be asked?"""
-        return self.parameters.search.by_lines and self._lines is None
+        return self.parameters.search.by_lines and self._lines is None and bool(self._by_lines.any())
 
     def round(self) -> Hypotheses:
         """Hypotheses of one more round, best first: of pairs of surface; once, for models of which the first round of
         these found nothing, of lines.
         """
         if self._untried() and (self.search.rounds or not self.search.pool_left()):
-            limits, priors, found = self.parameters.search, self.parameters.priors, self._found() > 0
-            self._lines = LineSearch(self.scene, self.models, ~found, limits, self._seed, self.jobs, priors)
+            limits, priors, wanted = (
+                self.parameters.search,
+                self.parameters.priors,
+                self._by_lines & (self._found() == 0),
+            )
+            self._lines = LineSearch(self.scene, self.models, wanted, limits, self._seed, self.jobs, priors)
             if self._lines:
                 # What was refused for telling too little may be told by its lines.
                 again = [self._placements(c.model, [Pose(c.rotation, c.translation)]) for c, _ in self._refused]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import exp, log
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,13 +119,28 @@ class SearchParameters:
             require(getattr(self, name) >= 1, name, getattr(self, name), "1 or more")
 
 
+class Tally(NamedTuple):
+    """How the search for each of some models went, (models,).
+
+    tested : right pairs tested of an instance that shows λs of its surface, had there been one; inf where no pair is
+        left to draw
+    hits, shown : of the instances found: how often they were hit, and by how many right pairs
+    """
+
+    tested: Floats
+    hits: Floats
+    shown: Floats
+
+
 class Search:
     """The rounds of RANSAC over one scene, for all models together; the same seed gives the same rounds."""
 
     def __init__(
         self, scene: Scene, models: Sequence[Model], table: JointTable, arrays: ModelArrays,
-        parameters: SearchParameters, seed: int, jobs: int, priors: Priors = NOTHING_KNOWN,
+        parameters: SearchParameters, seed: int, jobs: int, learnt: Sequence[float] = (),
+        priors: Priors = NOTHING_KNOWN,
     ) -> None:  # fmt: skip
+        """Take a scene; learnt : of each model, the share of right pairs that found it elsewhere, 0: nobody knows."""
         self.scene, self.models, self.table, self.arrays = scene, models, table, arrays
         self._allowed = allowed_poses(models, priors, scene.fine.cells.offset)
         self.parameters, self.seed, self.jobs = parameters, seed, jobs
@@ -143,19 +158,19 @@ class Search:
         self.rounds, self.effort, self._last_share = 0, 0.0, 1.0
         self.pool = np.empty(0, np.intp)
         self._fill_pool()
-        self._expected = np.zeros(len(models))
+        self._finds = np.maximum(RIGHT_PAIR_FINDS, learnt or 0.0)
+        self._right, self._last_right = np.zeros(len(models)), np.zeros(len(models))
         self._served = np.zeros(len(models), np.bool_)  # models of which no further instance is wanted
-        self._learned = np.zeros((len(models), 2))  # hits, and what was shown, of the instances found
+        # Of the instances found: hits, and what they showed, in full rounds and in right pairs of one that shows λs.
+        self._learned = np.zeros((len(models), 3))
         self._look_for(parameters.overlap_ratio)
 
     def _look_for(self, overlap_ratio: float) -> None:
         """Look for instances that show this share of their surface, and more."""
         self._shown, self._until, chance = overlap_ratio, 0.0, self.parameters.chance_overlap
         # A right hypothesis puts so many of its samples on the scene, and chance some of the others.
-        self._least_hits, self._least_hits_at_first = (
-            wald_table(self.parameters.tests, shown + (1.0 - shown) * chance, chance)
-            for shown in (MEETS * overlap_ratio, overlap_ratio)
-        )
+        meets = MEETS * overlap_ratio
+        self._least_hits = wald_table(self.parameters.tests, meets + (1.0 - meets) * chance, chance)
 
     def look_deeper(self) -> bool:
         """Look for instances that show half of λs for some rounds; False where that is done already."""
@@ -240,8 +255,13 @@ class Search:
 
     def chance_missed(self) -> float:
         """Chance to have missed an instance that shows λs of its surface, for the model worst served so far."""
-        expected = np.where(self._learned[:, 1] > 0.0, self.effort * self._rate(), self._expected)
+        expected = np.where(self._learned[:, 1] > 0.0, self.effort * self._rate(), self._finds * self._right)
         return exp(-float(expected.min(initial=np.inf, where=~self._served)))
+
+    def tally(self) -> Tally:
+        """How the search has gone so far."""
+        tested = self._right if self.pool_left() else np.full(len(self.models), np.inf)
+        return Tally(tested, self._learned[:, 0], self._learned[:, 2])
 
     def _share(self) -> float:
         """The share of a full round that the next one needs be: as much as is missing."""
@@ -257,7 +277,8 @@ class Search:
 
     def learn(self, model: int, hits: int, support: float) -> None:
         """Learn from an instance how often the last round hit it: pairs on it go with the square of what it shows."""
-        self._learned[model] += max(hits, 1), self._last_share * (support / self.parameters.overlap_ratio) ** 2
+        shown = (support / self.parameters.overlap_ratio) ** 2
+        self._learned[model] += max(hits, 1), self._last_share * shown, self._last_right[model] * shown
         self._look_for(self.parameters.overlap_ratio)  # others are looked for as at first
 
     def _rate(self) -> Floats:
@@ -277,10 +298,14 @@ class Search:
         most = share * limits.hypotheses_a_round * self._draws.sides
         tested = affordable(drawn, self.table, most, rarest_first=limits.telling_first)
         self._expect(count, drawn.keys, tested.keys)
-        # The first round finds what is easily seen, in half of the time.
-        least = self._least_hits if self.rounds else self._least_hits_at_first
         trial = Trial(
-            self.table, self.arrays, self.scene.tolerant, self._origins, least, limits.normal_length_m, self._allowed
+            self.table,
+            self.arrays,
+            self.scene.tolerant,
+            self._origins,
+            self._least_hits,
+            limits.normal_length_m,
+            self._allowed,
         )
         self.rounds += 1
         self.effort += share
@@ -293,6 +318,7 @@ class Search:
         drawn_here : pairs at each rung; drawn, tested : keys of those that met a second point, and of those tested
         """
         cells, fine, shown = len(self.table.offsets) - 1, self.scene.fine, self.parameters.overlap_ratio
+        self._last_right[:] = 0.0
         count = np.bincount(drawn, minlength=cells)
         # None of a feature that was not drawn was left out: without this a scan too small for a pair is never done.
         share = np.where(count > 0, np.bincount(tested, minlength=cells) / np.maximum(count, 1), 1.0)
@@ -309,8 +335,8 @@ class Search:
                 shell = 2.0 * model.parameters.pairs.tolerance * model.spacing
                 partners = on_it * len(keys) / samples**2 * 2.0 * self._draws.tolerance / shell
                 second_on_it = partners / max(self._draws.partners(rung), partners, 1e-9)
-                right = drawn_here * first_on_it * second_on_it * float(share[keys].mean())
-                self._expected[number] += RIGHT_PAIR_FINDS * right
+                self._last_right[number] += drawn_here * first_on_it * second_on_it * float(share[keys].mean())
+        self._right += self._last_right
 
 
 def shape_classes(bends: NDArray[np.floating], window: float) -> NDArray[np.int8]:

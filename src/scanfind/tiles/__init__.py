@@ -2,7 +2,8 @@
 
     sum up    each scan, once: its moments and beams, by bins, on disk      one task a scan
     cut       the site into tiles that fit the memory, from what bins hold
-    search    each tile with its margin, larger models first                one task a tile
+    search    each tile with its margin, larger models first; again where
+              other tiles tell that it was not enough                       one task a tile
     own       each instance once: by the tile that has its middle
     isolate   each scan, once more: the points of every instance            one task a scan
 
@@ -16,8 +17,7 @@ from __future__ import annotations
 import pickle
 import shutil
 import time
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -31,12 +31,9 @@ from pydantic_core import to_jsonable_python
 from scanfind.clock import Clock, say_if_compiling
 from scanfind.cloud import shift_for
 from scanfind.detection import Findings
-from scanfind.dimensions import dimensioned
 from scanfind.errors import Interrupted, UnreadableFileError, UnsupportedFormatError, UsageError
 from scanfind.find import ModelInput, box_searched, isolation_tolerance, models_of, require_points_in
-from scanfind.fit.polish import polished
 from scanfind.grid.moments import MomentGrid
-from scanfind.isolation.deviation import deviation_of
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.recognition.sizes import Sizes
 from scanfind.results.document import fingerprint
@@ -45,30 +42,23 @@ from scanfind.threads import available_cores
 from scanfind.tiles.listed import Listed, listed_of
 from scanfind.tiles.plan import (
     Held,
-    Tile,
     bin_blocks,
     estimate,
-    margin_bins,
-    tiles_of,
+    margin_of,
     words,
 )
+from scanfind.tiles.points import isolate_all, write_remainder
 from scanfind.tiles.stored import parts_of, reached_from, stored_bins
+from scanfind.tiles.sweep import search_all
 from scanfind.tiles.tasks import (
-    Cut,
     Found,
     Job,
     Searched,
     Summed,
     cell_of,
     count,
-    cut,
-    gathered,
-    on_disk,
     own,
-    plan_in,
-    search,
     sum_up,
-    surface_of,
 )
 from scanfind.tiles.work import Crew, Here, Workers, all_done, no_room, opened
 
@@ -76,6 +66,8 @@ if TYPE_CHECKING:
     from scanfind.detection import Detection, Refused
     from scanfind.library.model import Model
     from scanfind.progress import Progress
+    from scanfind.scans import CloudWriter
+    from scanfind.tiles.plan import Tile
 
 __all__ = ["find_in_tiles"]
 
@@ -99,6 +91,7 @@ def find_in_tiles(
     units: str | None = None,
     select: Sequence[str] = (),
     progress: Progress | None = None,
+    remainder: CloudWriter | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Findings:
     """As `find`, for sites of any size: the same detections, to what a pose is sure by.
@@ -111,6 +104,7 @@ def find_in_tiles(
             detections are mapped from it. None: a temporary one
         resume : go on with what `work` holds
         jobs : threads of a worker
+        remainder : takes every point that belongs to no detection; this process reads all scans once more for it
         say : is told, in a line, what the run will take, and what became of each scan
         the rest as for `find`; `search.time_limit_s` is of each tile. Models are not fitted in parts.
     Returns the findings; scans that could not be read are named in its notes and have no points.
@@ -136,7 +130,7 @@ def find_in_tiles(
             crew = stack.enter_context(Crew(executor or Here()))
             return _find(
                 folder, listed, library, crew, memory, parameters, seed, jobs or available_cores(), clock, tell, say,
-                resume=resume or work is None,
+                remainder, resume=resume or work is None,
             )  # fmt: skip
         except KeyboardInterrupt as error:
             if work is None:
@@ -147,7 +141,8 @@ def find_in_tiles(
 
 def _find(
     folder: Path, listed: Listed, library: list[Model], crew: Crew, memory: int, parameters: Parameters,
-    seed: int, jobs: int, clock: Clock, tell: Progress, say: Callable[[str], None], *, resume: bool,
+    seed: int, jobs: int, clock: Clock, tell: Progress, say: Callable[[str], None], remainder: CloudWriter | None, *,
+    resume: bool,
 ) -> Findings:  # fmt: skip
     sizes = Sizes(library, parameters)
     cell = sizes.finest_cell()
@@ -176,12 +171,15 @@ def _find(
     findings[:] = numbered(findings, parameters.search.max_instances)
     findings.refused = closest(searched)
 
-    if findings:
-        with clock("isolate"):
-            one = largest or searched[-1]
-            tolerance = isolation_tolerance(parameters.isolate, one.noise, one.cell)
+    with clock("isolate"):
+        one = largest or searched[-1]
+        tolerance = isolation_tolerance(parameters.isolate, one.noise, one.cell)
+        placed = [Found(one.id, one.model, one.scene_from_model) for one in findings]
+        if findings:
             findings.tolerance_m = tolerance
-            findings[:] = isolate_all(job, listed, findings, tolerance, summed, crew, clock, tell)
+            findings[:] = isolate_all(job, listed, findings, placed, tolerance, summed, crew, clock, tell)
+        if remainder is not None:
+            write_remainder(job, listed, placed, tolerance, summed, remainder, tell)
     findings.expected = parameters.priors.expected([model.name for model in library])
     findings.scans, findings.crs = [one.told for one in summed], listed.crs()
     findings.missing = [f"{one.told.path} was left out: {one.missing}" for one in summed if one.missing]
@@ -199,7 +197,7 @@ def _find(
 
 def keep_memory(job: Job, sizes: Sizes, listed: Listed, say: Callable[[str], None]) -> None:
     """Say what the run will take; raise UsageError where the memory given is not enough for its smallest tile."""
-    groups = [(cell_of(job, size.models)[0], max(model.diameter for model in size.models)) for size in sizes.groups()]
+    groups = [(cell_of(job, size.models)[0], margin_of(size.models)) for size in sizes.groups()]
     needs = estimate(listed.infos(), groups, job.cell, job.bin_m())
     say(f"{needs.words()}; {words(job.memory)} a worker")
     if needs.least_memory > job.memory:
@@ -293,40 +291,7 @@ def held_by(job: Job, parts: list[Path], crew: Crew) -> Held:
     return Held(bins, rows, reached_from(parts) / job.bin_m())
 
 
-def search_all(
-    job: Job, group: int, models: list[Model], held: Held, summed: list[Summed],
-    folders: list[Path], standing: Sequence[Detection], searched: list[Searched], crew: Crew, tell: Progress,
-) -> dict[Tile, Searched]:  # fmt: skip
-    """What every tile of the site holds of the models of one size."""
-    _, levels = cell_of(job, models)
-    # A cell of a level above stands for four of a surface.
-    tiles = tiles_of(held._replace(rows=held.rows // 4**levels), margin_bins(models, job.bin_m()), job.memory)
-    taken = [Found(k, one.model, one.scene_from_model) for k, one in enumerate(standing)]
-    reach = 2.0 * max((one.reach for one in searched), default=0.0)
-    signed = all(one.signed for one in summed)
-    done = 0
-
-    def told(name: str, one: Searched) -> None:
-        nonlocal done
-        done += 1
-        tell("search", done, len(tiles))
-
-    def found(deeper: bool) -> dict[Tile, Searched]:
-        name = f"search-{group}-deeper" if deeper else f"search-{group}"
-        tasks = {
-            f"{name}-{tile.name()}": (search, job, group, tile, taken, reach, signed, folders, deeper) for tile in tiles
-        }
-        return dict(zip(tiles, all_done(job.folder, crew, tasks, told), strict=True))
-
-    # As in one piece: deeper where the whole site shows too little, not where a tile shows nothing, as most tiles do.
-    first = found(deeper=False)
-    counts = Counter(one.model for one in own(first, job))
-    expected = job.parameters.priors.expected([model.name for model in models])
-    enough = counts.total() > 0 and all(counts[name] >= count for name, count in expected.items())
-    return first if enough else found(job.parameters.search.deeper)
-
-
-def typical(found: dict[Tile, Searched]) -> list[Searched]:
+def typical(found: Mapping[Tile, Searched]) -> list[Searched]:
     """Searches by how their noise ranks about its median among those that found something, nearest first."""
     with_some = [one for _, one in sorted(found.items()) if one.detections]
     middle = float(np.median([one.noise for one in with_some])) if with_some else 0.0
@@ -348,43 +313,6 @@ def closest(searched: Sequence[Searched]) -> list[Refused]:
         if len(same) < REFUSED_SHOWN and all(np.linalg.norm(o.scene_from_model.translation - at) > 1e-3 for o in same):
             kept.append(one)
     return kept
-
-
-def isolate_all(
-    job: Job, listed: Listed, findings: Findings, tolerance: float, summed: list[Summed], crew: Crew,
-    clock: Clock, tell: Progress,
-) -> list[Detection]:  # fmt: skip
-    """Every detection with its raw points, on disk, and fitted to them."""
-    found = [Found(one.id, one.model, one.scene_from_model) for one in findings]
-    firsts = np.cumsum([0, *(one.scans for one in summed)]).tolist()
-    readable = [k for k, one in enumerate(summed) if not one.missing]
-    tasks = {f"cut-{k:05d}": (cut, job, listed.all[k].scan, k, found, tolerance, firsts[k]) for k in readable}
-    done, expected = 0, sum(one.told.points for one in summed)
-
-    def told(name: str, one: Cut) -> None:
-        nonlocal done
-        done += summed[int(name.rpartition("-")[2])].told.points
-        tell("isolate", done, expected)
-
-    cuts = list(zip([job.folder / name for name in tasks], all_done(job.folder, crew, tasks, told), strict=True))
-    stations = [place for one in summed for place in one.told.stations]
-    measured = []
-    for one in findings:
-        cut_out = gathered(cuts, one.id)
-        with_points = one.with_points(cut_out, deviation_of(cut_out.deviation) if len(cut_out) else None)
-        with clock("refine"):
-            surface = surface_of(job.folder, one.model, tolerance)
-            fitted = polished(with_points, surface, job.parameters.refine, job.jobs)
-        with clock("measure"):
-            plan = plan_in(job.folder, one.model) if job.parameters.isolate.dimensions else None
-            if plan and fitted.isolated is not None:
-                fitted = dimensioned(fitted, plan, surface, fitted.isolated, stations, tolerance, jobs=job.jobs)
-        points = fitted.isolated or cut_out
-        try:
-            measured.append(replace(fitted, isolated=on_disk(points, job.folder / f"points-{one.id:05d}")))
-        except OSError as error:
-            raise no_room(job.folder, error) from error
-    return measured
 
 
 def scan_name(number: int) -> str:

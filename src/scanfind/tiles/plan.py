@@ -23,6 +23,9 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 BLOCK_CELLS = 8  # along the edge of a block
+# A tile also tells what it found so far beyond its border, in diameters: at the border itself two tiles may each think
+# that the middle of an instance lies with the other.
+RIM = 1.0 / 30.0
 LEAST_BIN_M = 1.0  # smaller bins are cut no better, and a site has a million of them
 
 # What a process takes before it has read a point: Python, its libraries, compiled kernels, one chunk of points.
@@ -48,6 +51,16 @@ class Tile(NamedTuple):
         x, y, z = self.low
         a, b, c = self.high
         return Tile((x - margin, y - margin, z - margin), (a + margin, b + margin, c + margin))
+
+    def halves(self) -> tuple[Tile, Tile]:
+        """Cut across its longest side."""
+        axis = int(np.subtract(self.high, self.low).argmax())
+
+        def cut(corner: tuple[int, int, int]) -> tuple[int, int, int]:
+            x, y, z = ((self.low[k] + self.high[k]) // 2 if k == axis else at for k, at in enumerate(corner))
+            return x, y, z
+
+        return Tile(self.low, cut(self.high)), Tile(cut(self.low), self.high)
 
     def holds(self, bins: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Which of some bins (K, 3) are in it."""
@@ -80,9 +93,10 @@ def bin_metres(cell: float, blocks: int) -> float:
     return float(cell * BLOCK_CELLS * 2**blocks)
 
 
-def margin_bins(models: Sequence[Model], bin_m: float) -> int:
-    """How many bins around a tile hold all of every model whose middle is in it."""
-    return ceil(max(model.diameter for model in models) / bin_m)
+def margin_of(models: Sequence[Model]) -> float:
+    """How far around a tile, metres, every model reaches whose middle is in it or in its rim."""
+    reaches = [np.linalg.norm(m.samples.points - m.samples.points.mean(axis=0), axis=1).max() for m in models]
+    return max(float(reach) + RIM * model.diameter for reach, model in zip(reaches, models, strict=True))
 
 
 class Held(NamedTuple):
@@ -95,6 +109,11 @@ class Held(NamedTuple):
     bins: Ints
     rows: Ints
     reached: Floats
+
+    def within(self, tile: Tile) -> Held:
+        """What lies in a tile."""
+        inside = tile.holds(self.bins)
+        return Held(self.bins[inside], self.rows[inside], self.reached)
 
     def needed(self, tile: Tile) -> int:
         """Bytes it takes to search a tile that has its margin."""
@@ -109,30 +128,27 @@ def tiles_of(held: Held, margin: int, memory: int) -> list[Tile]:
     Raises UsageError where a single bin with its margin does not.
     """
     bins = held.bins
-    todo = [Tile((*bins.min(axis=0).tolist(),), (*(bins.max(axis=0) + 1).tolist(),))] if len(bins) else []
+    todo = [(Tile((*bins.min(axis=0).tolist(),), (*(bins.max(axis=0) + 1).tolist(),)), held)] if len(bins) else []
     tiles = []
     while todo:
-        tile = todo.pop()
-        mine = tile.holds(bins)
-        if not mine.any():
+        tile, around = todo.pop()
+        mine = around.bins[tile.holds(around.bins)]
+        if not len(mine):
             continue
         # To what it holds: halves of an L-shaped site would else keep the empty corner.
-        tile = Tile((*bins[mine].min(axis=0).tolist(),), (*(bins[mine].max(axis=0) + 1).tolist(),))
-        needed = held.needed(tile.grown(margin))
+        tile = Tile((*mine.min(axis=0).tolist(),), (*(mine.max(axis=0) + 1).tolist(),))
+        around = around.within(tile.grown(margin))
+        needed = around.needed(tile.grown(margin))
         if needed <= memory:
             tiles.append(tile)
             continue
-        sizes = np.subtract(tile.high, tile.low)
-        if sizes.max() == 1:
+        if max(np.subtract(tile.high, tile.low)) == 1:
             msg = (
                 f"--memory is too small: the smallest tile needs {words(needed)}: give more, "
                 "or larger cells (grid.cell_m)"
             )
             raise UsageError(msg)
-        axis = int(sizes.argmax())
-        middle = tile.low[axis] + int(sizes[axis]) // 2
-        todo.append(Tile(tile.low, tuple(middle if k == axis else v for k, v in enumerate(tile.high))))  # type: ignore[arg-type]
-        todo.append(Tile(tuple(middle if k == axis else v for k, v in enumerate(tile.low)), tile.high))  # type: ignore[arg-type]
+        todo += [(half, around) for half in tile.halves()]
     return sorted(tiles)
 
 
@@ -162,7 +178,7 @@ def estimate(infos: Sequence[ScanInfo], sizes: Sequence[tuple[float, float]], fi
     """What a search will take.
 
     infos : of the scans' headers
-    sizes : the cell and the largest diameter of the models searched together, metres, of each such group
+    sizes : the cell and the margin of the models searched together, metres, of each such group
     finest : the cell in which points are summed; bin_m : the edge of a bin
     """
     counts = [info.points for info in infos]
@@ -174,7 +190,7 @@ def estimate(infos: Sequence[ScanInfo], sizes: Sequence[tuple[float, float]], fi
         rows = min(most, ROWS_A_SQUARE_CELL * floor / cell**2)
         return int(BASE_BYTES + stations * STATION_BYTES + ROW_BYTES * rows)
 
-    least = max(memory((bin_m * (1 + 2 * ceil(diameter / bin_m))) ** 2, cell) for cell, diameter in sizes)
+    least = max(memory((bin_m * (1 + 2 * ceil(margin / bin_m))) ** 2, cell) for cell, margin in sizes)
     boxes = np.array([info.bounds for info in infos if info.bounds is not None])
     floor = -1.0
     if len(boxes) == len(infos) > 0:

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -27,21 +28,19 @@ from scanfind.pose import Pose
 from scanfind.recognition.recognise import Standing
 from scanfind.recognition.sizes import Size, Sizes, by_size
 from scanfind.scans.sources import Scan, source_of
-from scanfind.tiles.plan import BASE_BYTES, Tile, bin_metres, margin_bins
+from scanfind.tiles.plan import BASE_BYTES, RIM, Tile, bin_metres, margin_of
 from scanfind.tiles.stored import Store, beams_into, count_in, parts_of, rows_in, summed_rows
 
 if TYPE_CHECKING:
     from scanfind.dimensions import Plan
     from scanfind.kernels.distance import NearSurface
     from scanfind.library.model import Model
+    from scanfind.search.surface import Tally
 
 # A grid is written out when it takes a third of the memory: its arrays double, and a chunk of points lies beside it.
 GRID_SHARE = 1.0 / 3.0
 LEAST_GRID_BYTES = 50_000_000
 STATIONS_AT_ONCE = 16  # whose beams are held while a scan is summed up, 6 MB each
-# A tile also tells what it found so far beyond its border, in diameters: at the border itself two tiles may each think
-# that the middle of an instance lies with the other.
-RIM = 1.0 / 30.0
 
 
 @dataclass(frozen=True)
@@ -77,6 +76,10 @@ class Job:
         """The edge of a bin, metres."""
         return bin_metres(self.cell, self.blocks)
 
+    def margin(self, models: Sequence[Model]) -> int:
+        """How many bins around a tile the search for some models needs."""
+        return ceil(margin_of(models) / self.bin_m())
+
 
 class Summed(NamedTuple):
     """What became of one scan. missing : why it could not be read; then nothing of it is used."""
@@ -92,6 +95,7 @@ class Searched(NamedTuple):
     """What was found in one tile, its own or nearly so; see `own`.
 
     noise, cell, reach : of the search, metres
+    tally : how it went, for each model
     """
 
     detections: list[Detection]
@@ -100,6 +104,7 @@ class Searched(NamedTuple):
     noise: float
     cell: float
     reach: float
+    tally: Tally
 
 
 class Cut(NamedTuple):
@@ -173,13 +178,13 @@ def count(folder: Path, parts: Sequence[Path], bins: NDArray[np.int64]) -> NDArr
 
 def search(
     folder: Path, job: Job, group: int, tile: Tile, standing: Sequence[Found], reach: float, signed: bool,
-    scans: Sequence[Path], deeper: bool,
+    scans: Sequence[Path], learnt: Sequence[float], deeper: bool,
 ) -> Searched:  # fmt: skip
     """Search a tile, with its margin, for the models of one size.
 
     standing : instances of larger models; reach : how far from their surface their points may lie, metres
     scans : the folders of those summed up
-    deeper : see SearchParameters
+    learnt : see Search; deeper : see SearchParameters
     """
     models = by_size(job.models())[group]
     # How many there are of the whole site says nothing of a tile.
@@ -188,7 +193,10 @@ def search(
     grid = grid_of(job, models, tile, signed, scans)
     taken = [Standing(surface_of(job.folder, one.model, reach), one.scene_from_model) for one in standing]
     found = Sizes(models, own)
-    found.add(recognise(Size(models, 0, 1), grid, taken, own, job.seed, job.jobs, Clock(), _silent, at_design=False))
+    search = recognise(
+        Size(models, 0, 1), grid, taken, own, job.seed, job.jobs, Clock(), _silent, at_design=False, learnt=learnt
+    )
+    found.add(search)
     middles = {model.name: model.samples.points.mean(axis=0) for model in models}
     diameters = {model.name: model.diameter for model in models}
 
@@ -198,13 +206,13 @@ def search(
 
     return Searched(
         [one for one in found.detections() if near(one)], [one for one in found.refused() if near(one)], found.notes(),
-        found.noise(), found.cell(), found.all[0].reach(),
+        found.noise(), found.cell(), search.reach(), search.search.tally(),
     )  # fmt: skip
 
 
 def grid_of(job: Job, models: Sequence[Model], tile: Tile, signed: bool, scans: Sequence[Path]) -> MomentGrid:
     """The moments of a tile with its margin, in the cells its models are searched with, and the beams into it."""
-    box = tile.grown(margin_bins(models, job.bin_m()))
+    box = tile.grown(job.margin(models))
     parts = parts_of(scans)
     cell, levels = cell_of(job, models)
     # Shards are not quite of one size.
@@ -258,13 +266,18 @@ def own(searched: Mapping[Tile, Searched], job: Job) -> list[Detection]:
     return sorted((one for _, one in kept), key=lambda one: order[id(one)])
 
 
+def isolator_of(job: Job, found: Sequence[Found], tolerance: float) -> Isolator:
+    """What says of each raw point to which instance it belongs."""
+    placed = [Placed(one.id, surface_of(job.folder, one.model, tolerance), one.scene_from_model) for one in found]
+    return Isolator(placed, IsolateParameters(tolerance), jobs=job.jobs)
+
+
 def cut(folder: Path, job: Job, scan: Scan, number: int, found: Sequence[Found], tolerance: float, first: int) -> Cut:
     """Pass over a scan once more; the points of detections lie in the folder then, in the order of the file.
 
     first : the number of its first scan among all
     """
-    placed = [Placed(one.id, surface_of(job.folder, one.model, tolerance), one.scene_from_model) for one in found]
-    isolator = Isolator(placed, IsolateParameters(tolerance), jobs=job.jobs)
+    isolator = isolator_of(job, found, tolerance)
     source = source_of(scan, None if job.origin is None else np.array(job.origin), number)
     pieces: list[tuple[int, int, int, int]] = []
     dtypes: list[np.dtype[Any]] = []

@@ -176,7 +176,8 @@ def outcome_of(future: Future[Any]) -> Any:
         if not type(error).__module__.startswith(("distributed", "concurrent.futures._base")):
             raise
         # KilledWorker, CommClosedError, a task cancelled because its scheduler is gone.
-        msg = f"the cluster gave up on a task ({type(error).__name__}): see its log, and give --resume to go on"
+        why = "its scheduler is gone" if isinstance(error, TaskCancelled) else f"{type(error).__name__}, see its log"
+        msg = f"the cluster gave up on a task ({why}): give --resume to go on with what is done"
         raise OutputError(msg) from error
 
 

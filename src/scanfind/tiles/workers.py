@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
@@ -30,6 +31,8 @@ def cluster(address: str) -> Callable[[], Executor]:
         raise MissingExtraError(msg) from error
 
     def connected() -> Executor:
+        # It logs a traceback where its scheduler is gone; that is told in one line, see `outcome_of`.
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         try:
             client = Client(address)
         except (OSError, ValueError) as error:

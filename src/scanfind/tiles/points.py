@@ -1,0 +1,84 @@
+"""The raw points of a site once more: those of each detection, in any number of workers, and what is left."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scanfind.dimensions import dimensioned
+from scanfind.find import write_rest
+from scanfind.fit.polish import polished
+from scanfind.isolation.deviation import deviation_of
+from scanfind.isolation.isolate import subset
+from scanfind.tiles.tasks import Cut, cut, gathered, isolator_of, on_disk, plan_in, surface_of
+from scanfind.tiles.work import Crew, all_done, no_room
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from scanfind.clock import Clock
+    from scanfind.detection import Detection, Findings
+    from scanfind.progress import Progress
+    from scanfind.scans import CloudWriter
+    from scanfind.tiles.listed import Listed
+    from scanfind.tiles.tasks import Found, Job, Summed
+
+
+def isolate_all(
+    job: Job, listed: Listed, findings: Findings, found: Sequence[Found], tolerance: float, summed: list[Summed],
+    crew: Crew, clock: Clock, tell: Progress,
+) -> list[Detection]:  # fmt: skip
+    """Every detection with its raw points, on disk, and fitted to them."""
+    tasks = {
+        f"cut-{k:05d}": (cut, job, listed.all[k].scan, k, found, tolerance, first) for k, first in readable(summed)
+    }
+    done, expected = 0, sum(one.told.points for one in summed)
+
+    def told(name: str, one: Cut) -> None:
+        nonlocal done
+        done += summed[int(name.rpartition("-")[2])].told.points
+        tell("isolate", done, expected)
+
+    cuts = list(zip([job.folder / name for name in tasks], all_done(job.folder, crew, tasks, told), strict=True))
+    stations = [place for one in summed for place in one.told.stations]
+    measured = []
+    for one in findings:
+        cut_out = gathered(cuts, one.id)
+        with_points = one.with_points(cut_out, deviation_of(cut_out.deviation) if len(cut_out) else None)
+        with clock("refine"):
+            surface = surface_of(job.folder, one.model, tolerance)
+            fitted = polished(with_points, surface, job.parameters.refine, job.jobs)
+        if job.parameters.isolate.dimensions and fitted.isolated is not None:
+            with clock("measure"):
+                plan = plan_in(job.folder, one.model)
+                if plan is not None:
+                    fitted = dimensioned(fitted, plan, surface, fitted.isolated, stations, tolerance, jobs=job.jobs)
+        points = fitted.isolated or cut_out
+        try:
+            measured.append(replace(fitted, isolated=on_disk(points, job.folder / f"points-{one.id:05d}")))
+        except OSError as error:
+            raise no_room(job.folder, error) from error
+    return measured
+
+
+def write_remainder(
+    job: Job, listed: Listed, found: Sequence[Found], tolerance: float, summed: list[Summed], remainder: CloudWriter,
+    tell: Progress,
+) -> None:  # fmt: skip
+    """Every point that belongs to no detection, in the order of the scans: one file is written by one process."""
+    isolator = isolator_of(job, found, tolerance)
+    done, expected = 0, sum(one.told.points for one in summed)
+    for k, first in readable(summed):
+        for chunk in listed.all[k].opened(listed.origin).chunks(first):
+            owner, _ = isolator.cut(chunk)
+            write_rest(remainder, subset(chunk, owner == 0))
+            done += len(chunk)
+            tell("remainder", done, expected)
+
+
+def readable(summed: Sequence[Summed]) -> list[tuple[int, int]]:
+    """The scans that could be read: their number, and that of their first setup among all."""
+    firsts = np.cumsum([0, *(one.scans for one in summed)]).tolist()
+    return [(k, firsts[k]) for k, one in enumerate(summed) if not one.missing]
