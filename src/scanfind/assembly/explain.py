@@ -28,7 +28,7 @@ from scanfind.assembly.points import fitted_to_points, placed_faces
 from scanfind.cloud import OrientedCloud
 from scanfind.detection import PartFit
 from scanfind.evidence.free_space import Limits, caster_of, spoken_of
-from scanfind.evidence.verify import ROUGHLY_KNOWN, Evidence, gather_support, why_refused
+from scanfind.evidence.verify import Evidence, gather_support, why_refused
 from scanfind.fit.refine import motion_of, triple
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose, nearest_rotation, rotation_from_vector, rotation_vector
@@ -345,5 +345,5 @@ def together(
         samples, supported, sum(one.telling * one.samples for one in seen) / samples,
         float(np.sqrt(squares / supported)) if supported else float("inf"),
         spoken_of(built, caster_of(built), reference, view.scene.beams, limits),
-        np.unique(np.concatenate([one.claims for one in seen])), against=ROUGHLY_KNOWN,
+        np.unique(np.concatenate([one.claims for one in seen])), rough=True,
     )  # fmt: skip

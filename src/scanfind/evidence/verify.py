@@ -41,7 +41,7 @@ class VerifyParameters:
     least_facing : cosine to the beam below which a surface may return nothing
     penalty_weight : how much surface that beams passed through counts against as much on the scan; 0: the paper, which
         looks at support
-    beside_weight : the same for surface beside which they ended; see also Evidence.against
+    beside_weight : the same for surface beside which they ended, of a pose that explains much (WELL_EXPLAINED)
     shared : share of its support a detection may have in common with a better one
     alternatives : how many poses a model could be mistaken for, by its own symmetry, are tried against the best
     """
@@ -57,7 +57,7 @@ class VerifyParameters:
     margin_cells: float = 1.0
     least_facing: float = 0.25
     penalty_weight: float = 20.0
-    beside_weight: float = 2.5
+    beside_weight: float = 0.75
     shared: float = 0.2
     alternatives: int = 24
 
@@ -80,9 +80,12 @@ class VerifyParameters:
 # Share of a model's surface that scans from a few sides show: full marks where nothing tells hidden from missing.
 EXPECTED_BLIND = 0.5
 BELIEVED_SUPPORT = 0.04
-# What is not there counts so much where the model is not known to the noise: a piece of scan has ragged edges, parts
-# that are fitted one by one were not built to the drawing, and neighbours lean on an element in its place.
-ROUGHLY_KNOWN = 0.3
+# Telling share of a pose that explains so much of its surroundings that it may be off here and there, as built things
+# are (a spool 6 mm long with a flange askew: 5 % beside). Of one that explains less, beside counts more in proportion.
+WELL_EXPLAINED = 0.5
+# Where the model is not known to the noise it does not, and through counts so much: a piece of scan has ragged edges,
+# parts that are fitted one by one were not built to the drawing, and neighbours lean on an element in its place.
+ROUGHLY_THROUGH = 0.3
 # On the coarse level a sample seen through counts so much against one supported: there many are by mistake.
 ROUGH_WEIGHT = 2.0
 # Points in a coarse cell up to which the eight fine ones in it are mostly empty.
@@ -98,7 +101,7 @@ class Evidence(NamedTuple):
     spoken : what the beams say of the surface
     claims : surfels that support it, ascending
     lines : of its lines, how much lies on the scene's beyond chance (lines.LineSearch); 0 where these were not asked
-    against : how much what is not there counts, as against a surface that is known to the noise
+    rough : the model is not known to the noise
     """
 
     samples: int
@@ -108,13 +111,17 @@ class Evidence(NamedTuple):
     spoken: Spoken
     claims: NDArray[np.intp]
     lines: float = 0.0
-    against: float = 1.0
+    rough: bool = False
 
-    def there(self, parameters: VerifyParameters, against: float = 1.0) -> float:
-        """The share of the looked-at surface that is there, where what is not counts by its weights times `against`."""
+    def there(self, parameters: VerifyParameters, *, in_place: bool = False) -> float:
+        """The share of the looked-at surface that is there, where what is not counts by its weights; see `score`."""
         on, beside, through, _ = self.spoken
-        missed = parameters.beside_weight * beside + parameters.penalty_weight * through
-        return on / (on + min(against, self.against) * missed) if on else 0.0
+        if not on:
+            return 0.0
+        rough = self.rough or in_place
+        beside *= parameters.beside_weight * (1.0 if rough else max(1.0, WELL_EXPLAINED / max(self.telling, 1e-9)))
+        through *= parameters.penalty_weight * (ROUGHLY_THROUGH if rough else 1.0)
+        return on / (on + beside + through)
 
     def support(self) -> float:
         """The paper's λs."""
@@ -140,7 +147,7 @@ def score(evidence: Evidence, blind: bool, parameters: VerifyParameters, *, in_p
     if blind:
         return min(1.0, evidence.support() / EXPECTED_BLIND)
     if in_place:
-        return evidence.there(parameters, ROUGHLY_KNOWN)
+        return evidence.there(parameters, in_place=True)
     # Few supported samples can agree by chance: the visible share is believed as far as their number goes. More than
     # half of a part lies on no floor or wall, whatever its shape tells: where a scan shows it alone, nothing tells.
     believed = evidence.telling + max(0.0, evidence.support() - 0.5) + evidence.lines
@@ -166,7 +173,7 @@ def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters, *
         return f"{evidence.support():.0%} of its surface lies on the scan, and no free space is known to tell more"
     on, beside, through, _ = evidence.spoken
     seen = max(on + beside + through, 1e-300)
-    if evidence.there(parameters, ROUGHLY_KNOWN if in_place else 1.0) < parameters.min_score:
+    if evidence.there(parameters, in_place=in_place) < parameters.min_score:
         if parameters.penalty_weight * through < parameters.beside_weight * beside:
             return f"{beside / seen:.0%} of the surface that scanners should have seen lies beside what they saw"
         return f"beams passed through {through / seen:.0%} of the surface that scanners should have seen"

@@ -18,7 +18,6 @@ from scanfind.evidence.ends import slid
 from scanfind.evidence.free_space import Design, Limits, Spoken, caster_of, spoken_by_each, towards
 from scanfind.evidence.rays import RayCaster
 from scanfind.evidence.verify import (
-    ROUGHLY_KNOWN,
     Evidence,
     Level,
     distances,
@@ -391,8 +390,8 @@ class Recognition:
         found = []
         for seen, on_lines, number, rotation, translation in zip(support, lines, *hypotheses[:3], strict=True):
             spoken = self._spoken_of(int(number), Pose(rotation, translation), in_place=in_place)
-            against = ROUGHLY_KNOWN if self.models[number].mesh is None else 1.0
-            found.append(Evidence(*seen[:-1], spoken, seen.claims, float(on_lines), against))
+            rough = self.models[number].mesh is None
+            found.append(Evidence(*seen[:-1], spoken, seen.claims, float(on_lines), rough))
         return found
 
     def _spoken_of(self, number: int, placed: Pose, *, in_place: bool = False) -> Spoken:
