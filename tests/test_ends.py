@@ -16,7 +16,7 @@ from scanfind.kernels.grid import NO_BEAM, cube_place, pack_beam
 from scanfind.library.model import Model, ModelParameters, build_model
 from scanfind.library.surface import SurfaceParameters
 from scanfind.pose import Pose
-from scanfind.recognition.recognise import design_of
+from scanfind.recognition.in_place import design_of
 from scanfind.recognition.swaps import are_alike, onto, pairs_alike
 from scanfind.simulate.parts import blocks, box
 from scanfind.simulate.scanner import Scanner, scan

@@ -26,7 +26,8 @@ from scanfind.library.model import Model, ModelParameters, build_model
 from scanfind.library.surface import SurfaceParameters
 from scanfind.parameters import PRESETS
 from scanfind.pose import Pose, random_rotation
-from scanfind.recognition.recognise import Candidate, Recognition
+from scanfind.recognition.candidate import Candidate
+from scanfind.recognition.recognise import Recognition
 from scanfind.search.hypotheses import Hypotheses, model_arrays
 from scanfind.simulate.parts import blocks
 
@@ -71,7 +72,7 @@ def weigh(place: tuple[float, float, float], turn: Floats | None = None, known: 
     found = Recognition(scene(known), models, joint_table(models), PARAMETERS, 0, 1)
     rotation = np.eye(3) if turn is None else turn
     pose = Hypotheses(np.zeros(1, np.int64), rotation[None], np.array([place]), np.ones(1))
-    return found.candidates(Refined(pose, np.eye(6)[None], np.ones(1), np.zeros(1)))[0]
+    return found.weighing.candidates(Refined(pose, np.eye(6)[None], np.ones(1), np.zeros(1)))[0]
 
 
 def facing_area(place: tuple[float, float, float]) -> float:
@@ -264,7 +265,7 @@ def test_evidence_is_each_pose_s_own() -> None:
     models, places = [box()], [ON_THE_BOX, (2.0, 0.7, 0.0), (5.0, 0.0, 0.0), (2.0, 3.0, 0.0)]
     found = Recognition(scene(), models, joint_table(models), PARAMETERS, 0, 2)
     poses = Hypotheses(np.zeros(4, np.int64), np.tile(np.eye(3), (4, 1, 1)), np.array(places), np.ones(4))
-    together = found.candidates(Refined(poses, np.zeros((4, 6, 6)), np.ones(4), np.zeros(4)))
+    together = found.weighing.candidates(Refined(poses, np.zeros((4, 6, 6)), np.ones(4), np.zeros(4)))
     for one, place in zip(together, places, strict=True):
         alone = weigh(place).evidence
         assert one.evidence._replace(claims=alone.claims) == alone
@@ -318,10 +319,11 @@ def test_thin_places_are_asked_on_the_coarse_level() -> None:
 def weigh_in(found: Recognition) -> tuple[float, float]:
     """Support of the box where it is, with and without the coarse level."""
     pose = Hypotheses(np.zeros(1, np.int64), np.eye(3)[None], np.array([ON_THE_BOX]), np.ones(1))
-    found._fit_near(pose, 2)
+    ground, weighing = found.ground, found.weighing
+    ground.fit_near(pose, 2)
     (both,), (fine,) = (
-        gather_support(pose, found.scene, found._fine, thin, found.arrays, found.signed, PARAMETERS.verify, 1)
-        for thin in (found._thin, None)
+        gather_support(pose, ground.scene, weighing.fine, thin, ground.arrays, ground.signed, PARAMETERS.verify, 1)
+        for thin in (weighing.thin, None)
     )
     return both.supported / both.samples, fine.supported / fine.samples
 

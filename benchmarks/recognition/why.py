@@ -65,14 +65,14 @@ def searched(trial: Trial) -> tuple[Recognition, Hypotheses]:
 def weighed(trial: Trial, part: Part, pose: Pose) -> Weighed:
     """How often the search draws a pose, and the evidence where scanfind's own refinement leads from it."""
     search, drawn = searched(trial)
-    scene, verify = search.scene, search.parameters.verify
+    scene, verify, arrays = search.ground.scene, search.ground.parameters.verify, search.ground.arrays
     number = [model.name for model in search.models].index(part.name)
     offset = pose.translation - scene.fine.cells.offset
     truth = Hypotheses(np.array([number]), pose.rotation[None], offset[None], np.ones(1))
-    own = outlines(drawn.take(np.flatnonzero(drawn.models == number)), search.arrays)
-    apart = distances(outlines(truth, search.arrays)[0], own)
+    own = outlines(drawn.take(np.flatnonzero(drawn.models == number)), arrays)
+    apart = distances(outlines(truth, arrays)[0], own)
     times = int(np.count_nonzero(apart < DRAWN_IN * search.models[number].diameter))
-    candidates = search.candidates(search.refine(truth))
+    candidates = search.weighing.candidates(search.refine(truth))
     if not candidates:
         return Weighed(times, 0.0, 0.0, 0.0, "refinement drops it")
     best = max(candidates, key=lambda candidate: candidate.score)

@@ -29,7 +29,8 @@ from scanfind.mesh import Mesh
 from scanfind.parameters import PRESETS, IsolationParameters, Parameters
 from scanfind.pose import Pose
 from scanfind.priors.allowed import box_around
-from scanfind.recognition.recognise import Recognition, design_of
+from scanfind.recognition.in_place import design_of
+from scanfind.recognition.recognise import Recognition
 from scanfind.recognition.sizes import Sizes
 from scanfind.scans.sources import Scan, Sources, require_points
 from scanfind.threads import available_cores
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     from scanfind.evidence.free_space import Design
     from scanfind.kernels.distance import NearSurface
     from scanfind.progress import Progress
-    from scanfind.recognition.recognise import Standing
+    from scanfind.recognition.candidate import Standing
     from scanfind.recognition.sizes import Size
     from scanfind.scans import CloudWriter
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scanfind.cloud import shift_for
 from scanfind.grid.scene import first_cell
 from scanfind.library.near_surface import near_model
-from scanfind.recognition.recognise import Standing
+from scanfind.recognition.candidate import Standing
 
 if TYPE_CHECKING:
     from scanfind.design.elements import Element
@@ -93,7 +93,7 @@ class Sizes:
             for number in {candidate.model for candidate in search.believed}:
                 near[search.models[number].name] = near_model(search.models[number], reach)
         return [
-            Standing(near[search.models[candidate.model].name], search.pose_of(candidate))
+            Standing(near[search.models[candidate.model].name], search.ground.in_scans(candidate.pose()))
             for search in self.all
             for candidate in search.believed
         ]
@@ -103,7 +103,7 @@ class Sizes:
         believed = [(candidate, search) for search in self.all for candidate in search.reported()]
         believed.sort(key=lambda one: (-round(one[0].score, 3), -one[0].area))
         return [
-            search.detection(number, candidate)
+            search.telling.detection(number, candidate)
             for number, (candidate, search) in enumerate(believed[: self._parameters.search.max_instances], start=1)
         ]
 
@@ -113,17 +113,17 @@ class Sizes:
 
     def built(self) -> dict[int, Floats]:
         """By detection, where it was fitted in parts: its faces (F, 3, 3) as built, scan frame, metres."""
-        return {number: faces for search in self.all for number, faces in search.built().items()}
+        return {number: faces for search in self.all for number, faces in search.telling.built().items()}
 
     def measured(self, found: Detection, points: Floats | None) -> Detection:
         """A detection with its parts fitted to raw points (N, 3) around it, scan frame; None: it has no parts."""
-        return found if points is None else self._of(found.model).measured(found, points)
+        return found if points is None else self._of(found.model).telling.measured(found, points)
 
     def with_stations(self, found: Detection, stations: Floats) -> Detection:
         """A detection with what each station says of it; stations : where all of them stood, in order, (S, 3)."""
         search = self._of(found.model)
         number = next(number for number, model in enumerate(search.models) if model.name == found.model)
-        return search.with_stations(number, found, stations)
+        return search.telling.with_stations(number, found, stations)
 
     def with_ends(self, detections: Sequence[Detection]) -> list[Detection]:
         """Detections, those that stand for an element slid to where beams say that their ends are."""
@@ -131,14 +131,14 @@ class Sizes:
             key: one
             for search in self.all
             for number in range(len(search.models))
-            for key, one in search.with_ends(number, detections).items()
+            for key, one in search.telling.with_ends(number, detections).items()
         }
         return [told.get(one.id, one) for one in detections]
 
     def elements(self, detections: Sequence[Detection], stations: Floats) -> list[Element]:
         """What became of each element of the design, in the order of the models; stations : see `with_stations`."""
         told = {
-            model.name: search.elements(number, detections, stations)
+            model.name: search.telling.elements(number, detections, stations)
             for search in self.all
             for number, model in enumerate(search.models)
         }
@@ -150,11 +150,11 @@ class Sizes:
 
     def cell(self) -> float:
         """Edge of the cells these were measured with, metres."""
-        return self._largest().scene.fine.cell
+        return self._largest().ground.scene.fine.cell
 
     def shift(self) -> tuple[float, float, float]:
         """What was taken off far coordinates while computing, metres."""
-        x, y, z = shift_for(self.all[0].scene.fine.cells.offset).tolist()
+        x, y, z = shift_for(self.all[0].ground.offset).tolist()
         return x, y, z
 
     def notes(self) -> list[str]:

@@ -25,7 +25,7 @@ from scanfind.isolation.isolate import IsolateParameters, Isolator, Placed, join
 from scanfind.library.near_surface import near_model
 from scanfind.parameters import Parameters
 from scanfind.pose import Pose
-from scanfind.recognition.recognise import Standing
+from scanfind.recognition.candidate import Standing
 from scanfind.recognition.sizes import Size, Sizes, by_size
 from scanfind.scans.sources import Scan, source_of
 from scanfind.tiles.plan import BASE_BYTES, RIM, Tile, bin_metres, margin_of

@@ -1,0 +1,116 @@
+"""Hypotheses fitted to the scene: on coarse surfels, on fine ones, and where these are too few to beams."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.evidence.free_space import towards
+from scanfind.evidence.verify import distinct, nearest, outlines
+from scanfind.fit.polish import polish
+from scanfind.fit.refine import Refined, icp, shrinking
+from scanfind.library.near_surface import near_model
+from scanfind.pose import Pose
+from scanfind.recognition.candidate import REFUSED_SHOWN
+from scanfind.search.hypotheses import joined
+
+if TYPE_CHECKING:
+    from scanfind.grid.surfels import Surfels
+    from scanfind.kernels.distance import NearSurface
+    from scanfind.recognition.ground import Ground
+    from scanfind.recognition.weighing import Weighing
+    from scanfind.search.hypotheses import Hypotheses
+
+Floats = NDArray[np.float64]
+
+BATCHES = 3  # of hypotheses refined a round, each far from where those before it went
+DRIFT_CELLS = 3  # of a gate of one cell, and two that a pose may still move after the coarse steps
+ON_BEAMS_CELLS, ON_BEAMS_STEPS = 1.5, 2  # how near the surface beams end that a pose is fitted to, and how often
+
+
+class Fitting:
+    """ICP of poses of the models sought, and which of them are worth it.
+
+    drawn_in : (models,) from how far off ICP leads to a pose, metres; apart : from which on poses are two
+    """
+
+    def __init__(self, ground: Ground, weighing: Weighing) -> None:
+        self._ground, self._weighing = ground, weighing
+        diameters = np.array([model.diameter for model in ground.models])
+        # Poses closer than a thirtieth of the diameter meet in one ICP; after it a hundredth tells them apart.
+        self._apart_before, self.apart = diameters / 30.0, diameters / 100.0
+        self._the_same = diameters / 1000.0
+        self.drawn_in = diameters / 10.0
+        self._near: dict[int, NearSurface] = {}
+
+    def refine(self, hypotheses: Hypotheses) -> Refined:
+        """ICP of what is distinct among the hypotheses on the coarse surfels; of what these do not refute, the fine."""
+        kept, met = self._ground.parameters.search.kept, None
+        rough: list[Refined] = []
+        for _ in range(BATCHES):
+            # One good instance passes the test hundreds of times: those poses must not use up the place of the others.
+            batch = hypotheses.take(distinct(hypotheses, self._ground.arrays, self._apart_before, kept, 4 * kept, met))
+            if not len(batch.models):
+                break
+            rough.append(self.coarse(batch))
+            met = joined([r.hypotheses for r in rough])
+            hypotheses = hypotheses.take(self._far_from(hypotheses, met))
+        if met is None:
+            return self.fine(hypotheses)
+        better = met.take(np.argsort(-np.concatenate([r.matched for r in rough]), kind="stable"))
+        better = better.take(distinct(better, self._ground.arrays, self.apart, kept, 2 * kept))
+        fine = self.fine(better.take(self._weighing.promising(better, REFUSED_SHOWN)))
+        if self._weighing.lines and self._ground.parameters.refine.raw_steps:
+            fine = self._on_beams(fine, self._weighing.lines.beyond_chance(fine.hypotheses) > 0.0)
+        fine = fine.take(np.argsort(-fine.matched, kind="stable"))
+        # What ended at one place is asked once.
+        return fine.take(distinct(fine.hypotheses, self._ground.arrays, self._the_same, kept, 2 * kept))
+
+    def _on_beams(self, refined: Refined, some: NDArray[np.bool_]) -> Refined:
+        """Refined poses, some of them (H,) fitted to where beams ended that went towards them.
+
+        Where cells are too empty for normals ICP ends within half a cell; held against the model's own faces the beams
+        themselves bring that to a millimetre, in ten milliseconds.
+        """
+        refine = self._ground.parameters.refine
+        found, models, scene = refined.hypotheses, self._ground.models, self._ground.scene
+        for k in np.flatnonzero(some):
+            number = int(found.models[k])
+            if number not in self._near:
+                self._near[number] = near_model(models[number], ON_BEAMS_CELLS * scene.fine.cell)
+            pose = Pose(found.rotations[k], found.translations[k])
+            for _ in range(ON_BEAMS_STEPS):
+                ends = towards(models[number], pose, scene.beams).ends()
+                fitted = polish(self._near[number], pose, ends, np.zeros(len(ends), np.int64), refine)
+                pose = fitted.scene_from_model if fitted else pose
+            found.rotations[k], found.translations[k] = pose.rotation, pose.translation
+        return refined
+
+    def _far_from(self, hypotheses: Hypotheses, met: Hypotheses) -> NDArray[np.intp]:
+        """The hypotheses that would not be drawn to where those in `met` went already (indices)."""
+        theirs, placed = outlines(met, self._ground.arrays), outlines(hypotheses, self._ground.arrays)
+        far = np.ones(len(placed), np.bool_)
+        for model in np.unique(hypotheses.models):
+            mine = hypotheses.models == model
+            far[mine] = nearest(placed[mine], theirs[met.models == model]) >= self.drawn_in[model]
+        return np.flatnonzero(far)
+
+    def coarse(self, hypotheses: Hypotheses) -> Refined:
+        """ICP on the coarse surfels."""
+        refine, coarse = self._ground.parameters.refine, self._ground.scene.coarse
+        gates = shrinking(refine.coarse_gates, refine.coarse_iterations, coarse.cell)
+        return self.icp(hypotheses, coarse, gates, refine.coarse_samples)
+
+    def fine(self, hypotheses: Hypotheses) -> Refined:
+        """ICP on the fine surfels, which are fitted around the poses."""
+        refine, fine = self._ground.parameters.refine, self._ground.scene.fine
+        self._ground.fit_near(hypotheses, DRIFT_CELLS)
+        gates = shrinking(refine.fine_gates, refine.fine_iterations, fine.cell)
+        return self.icp(hypotheses, fine, gates, refine.fine_samples)
+
+    def icp(self, hypotheses: Hypotheses, surfels: Surfels, gates: Floats, most_samples: int) -> Refined:
+        """ICP with these gates, metres, one a step."""
+        ground, agreement = self._ground, self._ground.parameters.refine.normal_agreement
+        return icp(hypotheses, surfels, ground.arrays, ground.signed, gates, most_samples, agreement, ground.jobs)

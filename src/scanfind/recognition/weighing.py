@@ -1,0 +1,125 @@
+"""Refined poses weighed: what surfels, beams and lines say of each."""
+
+from __future__ import annotations
+
+from math import ceil
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.evidence.free_space import Limits, Spoken, caster_of, spoken_by_each
+from scanfind.evidence.verify import Evidence, Level, gather_rough, gather_support, rough_score, score
+from scanfind.pose import Pose
+from scanfind.recognition.candidate import Candidate
+
+if TYPE_CHECKING:
+    from scanfind.evidence.free_space import Design
+    from scanfind.evidence.rays import RayCaster
+    from scanfind.fit.refine import Refined
+    from scanfind.recognition.ground import Ground
+    from scanfind.search.hypotheses import Hypotheses
+    from scanfind.search.lines import LineSearch
+
+Floats = NDArray[np.float64]
+
+ALL_SAMPLES = 1 << 30
+# Share of the score asked for that the evidence on the coarse surfels must reach: there 400 samples tell the final
+# score of a shop's 96 best poses within 0.2.
+PROMISING = 0.67
+NET_PENALTY = 2.0
+TOLD_BY_LINES = 12  # poses that these speak for, refined whatever the coarse surfels say
+EDGE_INLIERS = 2.0  # a laser's spot is a centimetre wide at 10 m: nearer to the outline some of it went past
+
+
+class Weighing:
+    """What the scene says of poses.
+
+    tells : how much surfels of the fine and of the coarse cells tell (Search.telling)
+    design : all elements where the design has them; None where nobody asks for them in their places
+    lines : what lines say, once these were asked
+    """
+
+    def __init__(self, ground: Ground, tells: tuple[Floats, Floats], design: Design | None) -> None:
+        self._ground, self.design = ground, design
+        self.lines: LineSearch | None = None
+        scene, parameters = ground.scene, ground.parameters
+        inlier = parameters.verify.inlier_noises * scene.noise
+        inliers = [inlier + parameters.verify.inlier_cells * level.cell for level in (scene.fine, scene.coarse)]
+        self.fine = Level(scene.fine, tells[0], ALL_SAMPLES, inliers[0])
+        self.thin = Level(scene.coarse, tells[1], ALL_SAMPLES, inliers[0])
+        self._rough = Level(scene.coarse, tells[1], parameters.refine.coarse_samples, inliers[1])
+        self._casters: dict[int, RayCaster] = {}
+
+    def candidates(self, refined: Refined, *, in_place: bool = False) -> list[Candidate]:
+        """Refined poses with their evidence; in_place : of where the design puts the models."""
+        self._ground.fit_near(refined.hypotheses, ceil(self._ground.parameters.verify.gate_cells))
+        found, models, blind, verify = [], self._ground.models, self._ground.blind, self._ground.parameters.verify
+        for k, seen in enumerate(self._evidence(refined.hypotheses, in_place=in_place)):
+            number = int(refined.hypotheses.models[k])
+            # What a pose explains of the scene, in samples; what beams passed through counts double.
+            net = (seen.telling - NET_PENALTY * seen.penalty()) * seen.samples
+            found.append(
+                Candidate(
+                    number, refined.hypotheses.rotations[k], refined.hypotheses.translations[k], refined.hessians[k],
+                    float(refined.rms[k]), seen, score(seen, blind, verify, in_place=in_place),
+                    net * models[number].area_of_a_sample(), in_place=in_place,
+                )
+            )  # fmt: skip
+        return found
+
+    def _evidence(self, hypotheses: Hypotheses, *, in_place: bool) -> list[Evidence]:
+        """What surfels and beams say of poses near which the fine surfels are fitted; in_place : see `candidates`."""
+        ground, verify = self._ground, self._ground.parameters.verify
+        support = gather_support(
+            hypotheses, ground.scene, self.fine, self.thin, ground.arrays, ground.signed, verify, ground.jobs
+        )  # fmt: skip
+        lines = self.lines.beyond_chance(hypotheses) if self.lines else np.zeros(len(support))
+        found = []
+        for seen, on_lines, number, rotation, translation in zip(support, lines, *hypotheses[:3], strict=True):
+            spoken = self.spoken_of(int(number), Pose(rotation, translation), in_place=in_place)
+            rough = ground.models[number].mesh is None
+            found.append(Evidence(*seen[:-1], spoken, seen.claims, float(on_lines), rough))
+        return found
+
+    def spoken_of(self, number: int, placed: Pose, *, in_place: bool = False) -> Spoken:
+        """What beams say of a model at a pose relative to the grid's offset; in_place : see `candidates`."""
+        return Spoken(*self.said_by_each(number, placed, in_place=in_place).sum(axis=0).tolist())
+
+    def said_by_each(self, number: int, placed: Pose, *, in_place: bool = False) -> Floats:
+        """What the beams of each of S scanners say, rows as of Spoken, (S, 4)."""
+        ground, limits = self._ground, self.limits(in_place=in_place)
+        return spoken_by_each(
+            ground.models[number], self.caster(number), placed, ground.scene.beams, limits,
+            self.design if in_place else None, ground.offset,
+        )  # fmt: skip
+
+    def limits(self, *, in_place: bool = False) -> Limits:
+        """When a beam is on a surface, beside it, or through; in_place : see `candidates`."""
+        verify, level = self._ground.parameters.verify, self.fine
+        edge = EDGE_INLIERS * level.inlier if in_place else 0.0
+        return Limits(level.inlier, level.margin(verify), verify.least_facing, edge)
+
+    def caster(self, number: int) -> RayCaster:
+        """The surface of a model, made ready for beams when first asked for."""
+        if number not in self._casters:
+            self._casters[number] = caster_of(self._ground.models[number])
+        return self._casters[number]
+
+    def promising(self, hypotheses: Hypotheses, shown: int) -> NDArray[np.intp]:
+        """Those whose evidence on the coarse surfels is not hopeless, and the best `shown` of each model (indices)."""
+        ground, verify = self._ground, self._ground.parameters.verify
+        rough = gather_rough(
+            hypotheses, ground.scene, self._rough, ground.arrays, ground.signed, verify, ground.jobs
+        )  # fmt: skip
+        scores = np.array([rough_score(seen, ground.blind) for seen in rough])
+        kept = scores >= PROMISING * verify.min_score
+        for model in np.unique(hypotheses.models):
+            theirs = np.flatnonzero(hypotheses.models == model)
+            kept[theirs[np.argsort(-scores[theirs], kind="stable")[:shown]]] = True
+        if self.lines:
+            # A pose on lines is half a cell off until it is fitted to beams, and looks worse than it is.
+            told = self.lines.beyond_chance(hypotheses)
+            best = np.argsort(-told, kind="stable")[:TOLD_BY_LINES]
+            kept[best[told[best] > 0.0]] = True
+        return np.flatnonzero(kept)
