@@ -104,15 +104,15 @@ def spoken(triangles: Floats, ends: tuple[Floats, Floats], limits: Limits) -> Sp
         cosine = abs(float(normals[face] @ way))
         if face < 0 or cosine < limits.facing:
             continue
-        if far > distance + limits.margin:
+        if abs(far - distance) * cosine <= limits.inlier:
+            what = "on"
+        elif far > distance + limits.margin:
             side = np.cross(way, [1.0, 0.0, 0.0] if abs(way[0]) < 0.6 else [0.0, 1.0, 0.0])
             side *= limits.inlier / np.linalg.norm(side)
             sides = [side, -side, np.cross(way, side), -np.cross(way, side)]
             if any(first_hit(start, way, triangles)[0] >= far - limits.margin for start in sides):
                 continue
             what = "through"
-        elif abs(far - distance) * cosine <= limits.inlier:
-            what = "on"
         else:
             what = "hidden" if far < distance - limits.margin else "beside"
         told[what] += angle * distance**2 / cosine

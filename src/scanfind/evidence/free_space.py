@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
+# What a beam says of a surface it would have met: see Spoken; a beam a hair within the outline says nothing.
+ON, BESIDE, THROUGH, HIDDEN, NOTHING = range(5)
+
 # Beams asked of a pose: a share of them is then known within a half per cent.
 MOST_BEAMS = 6000
 # Pixels this many sample spacings about each sample cover a model: no point of it is farther from one than 1.
@@ -100,42 +103,55 @@ def spoken_by_each(
     model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams], limits: Limits,
     design: Design | None = None, offset: Floats | None = None,
 ) -> Floats:  # fmt: skip
-    """What the beams of each of S scanners say: rows as of `Spoken`, (S, 4), m².
+    """What the beams of each of S scanners say: rows as of `Spoken`, (S, 4), m²; design, offset : see `verdicts`."""
+    met = verdicts(model, caster, placed, scanners, limits, design, offset)
+    said = [met.says == of for of in (ON, BESIDE, THROUGH, HIDDEN)]
+    return np.stack([np.bincount(met.scanner[each], met.area[each], len(scanners)) for each in said], axis=1)
+
+
+class Verdicts(NamedTuple):
+    """What each of B beams says that would have met a placed model.
+
+    where : (B, 3) the model's surface would have been met, model frame; area : (B,) the surface it speaks for, m²
+    scanner : (B,) whose it is; says : (B,) ON, BESIDE, THROUGH, HIDDEN or NOTHING
+    """
+
+    where: Floats
+    area: Floats
+    scanner: NDArray[np.intp]
+    says: NDArray[np.uint8]
+
+
+def verdicts(
+    model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams], limits: Limits,
+    design: Design | None = None, offset: Floats | None = None,
+) -> Verdicts:  # fmt: skip
+    """What beams say of a model placed by scene_from_model, relative to the grid's offset, one by one.
 
     design, offset : of a model that is in its place in it, what hides it there; the grid's offset, (3,)
     """
-    beams = towards(model, placed, scanners)
-    if not len(beams.ranges):
-        return np.zeros((len(scanners), 4))
-    back = placed.inverse()
+    beams, back = towards(model, placed, scanners), placed.inverse()
     origins, directions = back.move(beams.origins), beams.directions @ placed.rotation
     hits = caster.shoot(origins, directions)
     met = np.flatnonzero((hits.cosine >= limits.facing) & np.isfinite(hits.distance))
-    distance, cosine, ranges = hits.distance[met], hits.cosine[met], beams.ranges[met]
-    area = beams.angles[met] * distance**2 / cosine
-    through, hidden = ranges > distance + limits.margin, ranges < distance - limits.margin
-    on = np.abs(ranges - distance) * cosine <= limits.inlier
+    origins, directions, ranges = origins[met], directions[met], beams.ranges[met]
+    distance, cosine = hits.distance[met], hits.cosine[met]
+    says = np.full(len(met), BESIDE, np.uint8)
+    says[ranges < distance - limits.margin] = HIDDEN
+    says[np.abs(ranges - distance) * cosine <= limits.inlier] = ON
     # A beam a hair within the outline says nothing: the pose is no better than that.
-    passed = np.flatnonzero(through)
-    deep = within(
-        caster,
-        origins[met[passed]],
-        directions[met[passed]],
-        ranges[passed] - limits.margin,
-        limits.edge or limits.inlier,
-    )
-    edge = np.zeros(len(met), np.bool_)
-    edge[passed[~deep]] = True
-    beside = ~(on | through | hidden)
-    if design is not None and beside.any():
+    passed = np.flatnonzero((ranges > distance + limits.margin) & (says != ON))
+    before, apart = ranges[passed] - limits.margin, limits.edge or limits.inlier
+    deep = within(caster, origins[passed], directions[passed], before, apart)
+    says[passed] = np.where(deep, THROUGH, NOTHING)
+    if design is not None and (says == BESIDE).any():
         # Steel lies on steel: a plate of 10 mm on a flange is nearer to it than beams of free space tell apart. Half a
         # millimetre: faces that lie on each other hide nothing of each other.
-        some = np.flatnonzero(beside)
+        some = np.flatnonzero(says == BESIDE)
         theirs = beams.take(met[some]).moved(np.zeros(3) if offset is None else offset)
-        behind = some[design.met(model.name, theirs, limits.inlier) < distance[some] - 5e-4]
-        beside[behind], hidden[behind] = False, True
-    whose, said = beams.scanner[met], [each & ~edge for each in (on, beside, through, hidden)]
-    return np.stack([np.bincount(whose[each], area[each], len(scanners)) for each in said], axis=1)
+        says[some[design.met(model.name, theirs, limits.inlier) < distance[some] - 5e-4]] = HIDDEN
+    where = origins + directions * distance[:, None]
+    return Verdicts(where, beams.angles[met] * distance**2 / cosine, beams.scanner[met], says)
 
 
 class Towards(NamedTuple):
