@@ -21,7 +21,6 @@ from benchmarks.common import ROOT, Floats, median, seeds_of, tell, write_csv
 from scanfind.cloud import PointCloud
 from scanfind.design.elements import INSTALLED, NOT_FOUND
 from scanfind.evidence.rays import RayCaster
-from scanfind.find import models_of
 from scanfind.library import ModelLibrary
 from scanfind.mesh import Mesh, Placement
 from scanfind.models import read_models
@@ -29,6 +28,7 @@ from scanfind.simulate.parts import blocks
 from scanfind.simulate.placement import sample_oriented
 from scanfind.simulate.scanner import Scanner, scan
 from scanfind.simulate.scene import Scene, SceneObject
+from scanfind.sought import models_of
 
 STEEL = Path("ifc") / "schependomlaan" / "ROOT-staal" / "IFC-staal.ifc"
 DESIGNED, MOVED, MISSING, SWAPPED = "as designed", "moved", "missing", "swapped"

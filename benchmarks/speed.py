@@ -16,10 +16,10 @@ import numpy as np
 import scanfind
 from benchmarks.common import STAGES, Floats, median, seeds_of, tell, write_csv
 from benchmarks.shop import TARGETS, WARM_UP_POINTS
-from scanfind.find import models_of
 from scanfind.grid.scene import first_cell
 from scanfind.simulate.scanner import scan
 from scanfind.simulate.scenes import shop
+from scanfind.sought import models_of
 
 Result = TypeVar("Result")
 

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING
 
 from scanfind.clock import Clock, say_if_compiling, watched
 from scanfind.detection import Findings
-from scanfind.dimensions import dimensioned
 from scanfind.errors import UsageError
-from scanfind.find import plans_of, surfaces_of, with_points
 from scanfind.library import ModelLibrary
 from scanfind.results import MODELS, fill_folder, open_remainder, read_results, result_folder, schema
 from scanfind.results.document import findings_of
 from scanfind.scans.sources import Sources
+from scanfind.second_pass import plans_of, surfaces_of, with_dimensions, with_points
 from scanfind.threads import available_cores
 from scanfind.tolerances import judge_findings, profile_in
 
@@ -71,13 +70,9 @@ def isolate_again(
         stations = [place for scan in seen for place in scan.stations]
         with clock("measure"):
             # Where the parts were fitted one by one, the search measured them where they were built.
-            told = [
-                dimensioned(one, plan, surfaces[one.model], around[one.id], stations, reach)
-                if not one.parts and (plan := plans.get(one.model))
-                else one
-                for one in cut
-            ]
-        findings = Findings(told)
+            whole = with_dimensions([one for one in cut if not one.parts], plans, surfaces, around, stations, reach, {})
+            measured = {one.id: one for one in whole}
+        findings = Findings([measured.get(one.id, one) for one in cut])
         findings.refused, findings.notes = found.refused, found.notes
         findings.elements, findings.alignment = found.elements, found.alignment
         findings.shift, findings.crs, findings.tolerance_m = found.shift, found.crs, within

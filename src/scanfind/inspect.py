@@ -12,11 +12,12 @@ from scanfind.design.elements import INSTALLED, installed, placements_of
 from scanfind.design.thinned import Thinned
 from scanfind.errors import AlignmentError, UsageError
 from scanfind.evidence.free_space import Spoken
-from scanfind.find import find, models_of
+from scanfind.find import find
 from scanfind.library import ModelLibrary
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.priors.allowed import middle_of
 from scanfind.scans.sources import Sources
+from scanfind.sought import models_of
 from scanfind.tolerances import judge_findings, profile_allowing
 
 if TYPE_CHECKING:
@@ -24,13 +25,13 @@ if TYPE_CHECKING:
 
     from scanfind.design.elements import Element
     from scanfind.detection import Findings
-    from scanfind.find import ModelInput
     from scanfind.library.model import Model
     from scanfind.mesh import Placement
     from scanfind.pose import Pose
     from scanfind.priors import Priors
     from scanfind.progress import Progress
     from scanfind.scans.sources import Scan
+    from scanfind.sought import ModelInput
     from scanfind.tolerances import Profile
 
 

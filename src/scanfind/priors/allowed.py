@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.errors import UsageError
 from scanfind.pose import Pose
 from scanfind.priors import Priors, direction
 from scanfind.symmetry import pose_error
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from scanfind.kernels.allowed import Allowed
     from scanfind.library.model import Model
 
@@ -135,3 +138,25 @@ def starts(lists: Sequence[Floats]) -> NDArray[np.int64]:
 def unit(vector: Floats) -> Floats:
     """Of length 1."""
     return np.asarray(vector / np.linalg.norm(vector))
+
+
+def box_searched(library: Sequence[Model], priors: Priors, most: int | None) -> Floats | None:
+    """The box (2, 3), scans' frame, metres, that holds every instance the priors allow for; None: anywhere.
+
+    most : instances in all, None: any number
+
+    Raises UsageError for priors that do not fit the models.
+    """
+    priors.check([model.name for model in library], most)
+    return box_around(library, priors)
+
+
+def require_points_in(box: Floats | None, points: int, begins: ArrayLike | None) -> None:
+    """Raise UsageError where of a scan that `begins` at (3,) no point lies where instances are looked for."""
+    if box is not None and begins is not None and not points:
+        low, high, there = (" ".join(f"{x:.1f}" for x in corner) for corner in (*box, np.asarray(begins)))
+        msg = (
+            f"no point lies where the region, or the design with near_design_m, allows for an instance, {low} to "
+            f"{high}; the scan begins about {there}: give both in metres, in the scan's own frame"
+        )
+        raise UsageError(msg)

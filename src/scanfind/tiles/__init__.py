@@ -32,12 +32,14 @@ from scanfind.clock import Clock, say_if_compiling
 from scanfind.cloud import shift_for
 from scanfind.detection import Findings
 from scanfind.errors import Interrupted, UnreadableFileError, UnsupportedFormatError, UsageError
-from scanfind.find import ModelInput, box_searched, isolation_tolerance, models_of, require_points_in
 from scanfind.grid.moments import MomentGrid
 from scanfind.parameters import PRESETS, Parameters
+from scanfind.priors.allowed import box_searched, require_points_in
 from scanfind.recognition.sizes import Sizes
 from scanfind.results.document import fingerprint
 from scanfind.scans.sources import Scan
+from scanfind.second_pass import isolation_tolerance
+from scanfind.sought import ModelInput, models_of
 from scanfind.threads import available_cores
 from scanfind.tiles.listed import Listed, listed_of
 from scanfind.tiles.plan import (
@@ -147,7 +149,7 @@ def _find(
     sizes = Sizes(library, parameters)
     cell = sizes.finest_cell()
     blocks = bin_blocks(cell, min(model.diameter for model in library))
-    box = box_searched(library, parameters)
+    box = box_searched(library, parameters.priors, parameters.search.max_instances)
     job = Job(folder, cell, (0.0, 0.0, 0.0), blocks, memory, jobs, parameters, seed, listed.origin, box)
     keep_memory(job, sizes, listed, say)
 

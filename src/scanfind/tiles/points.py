@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scanfind.dimensions import dimensioned
-from scanfind.find import write_rest
 from scanfind.fit.polish import polished
 from scanfind.isolation.deviation import deviation_of
 from scanfind.isolation.isolate import subset
+from scanfind.second_pass import write_rest
 from scanfind.tiles.tasks import Cut, cut, gathered, isolator_of, on_disk, plan_in, surface_of
 from scanfind.tiles.work import Crew, all_done, no_room
 
