@@ -31,7 +31,8 @@ class ByParts:
 
     def explained(self, refused: Sequence[Candidate], believed: Sequence[Candidate]) -> list[Candidate]:
         """Those among the best refused that, with each part where it is, the evidence carries."""
-        ground, limits, found = self._ground, self._ground.parameters.assembly, list[Candidate]()
+        ground, limits = self._ground, self._ground.parameters.assembly
+        found: list[Candidate] = []
         claims = Claims(ground, believed)
         tried = dict.fromkeys(range(len(ground.models)), 0)
         best = {model: max((c.score for c in self._tried if c.model == model), default=0.0) for model in tried}
