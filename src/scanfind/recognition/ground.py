@@ -75,10 +75,13 @@ class Ground:
         """Why what is known beforehand speaks against a pose, in words; empty where it does not."""
         return why_not(self.models[candidate.model], self.parameters.priors, self.in_scans(candidate.pose()))
 
+    def why_refused(self, candidate: Candidate) -> str:
+        """Why the evidence does not carry a pose found anywhere; empty where it does."""
+        return why_refused(candidate.evidence, self.blind, self.parameters.verify)
+
     def why_not_believed(self, candidate: Candidate) -> str:
-        """Why that or the evidence speaks against a pose found anywhere; empty where neither does."""
-        verify = self.parameters.verify
-        return self.why_not_allowed(candidate) or why_refused(candidate.evidence, self.blind, verify)
+        """Why the one or the other speaks against a pose; empty where neither does."""
+        return self.why_not_allowed(candidate) or self.why_refused(candidate)
 
     def no_rows(self) -> NDArray[np.bool_]:
         """No row of the fine cells, to be marked."""

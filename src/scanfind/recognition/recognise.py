@@ -176,7 +176,7 @@ class Recognition:
         for candidate in self.weighing.candidates(refined):
             if known := ground.why_not_allowed(candidate):
                 self._refused.append((candidate, known))
-            elif reason := ground.why_not_believed(candidate):
+            elif reason := ground.why_refused(candidate):
                 refused.append((candidate, reason))
             else:
                 fresh.append(candidate)
@@ -185,8 +185,8 @@ class Recognition:
         self._refused += refused
         claims, believed = Claims(ground), list[Candidate]()
         for candidate in sorted([*self.believed, *fresh], key=lambda c: (not c.in_place, -c.area)):
-            taken = claims.hold(candidate) or stands_elsewhere(candidate, self._standing, ground)
-            if taken and not candidate.in_place:
+            free = candidate.in_place  # what adjoins it by design may share its surface
+            if not free and (claims.hold(candidate) or stands_elsewhere(candidate, self._standing, ground)):
                 self._refused.append((candidate, "another pose explains more of the same surface"))
                 continue
             best = candidate
