@@ -317,8 +317,9 @@ def spread(through: int, hidden: int, silent: int) -> int:
 
 
 def distinct(
-    hypotheses: Hypotheses, arrays: ModelArrays, apart: Floats, most: int, in_all: int, known: Hypotheses | None = None
-) -> NDArray[np.intp]:
+    hypotheses: Hypotheses, arrays: ModelArrays, apart: Floats, most: float = np.inf, in_all: float = np.inf,
+    known: Hypotheses | None = None,
+) -> NDArray[np.intp]:  # fmt: skip
     """The first of each group of poses that nearly coincide (indices), at most `most` of each model and `in_all`.
 
         apart : (models,) metres; poses that move no point of the model's outline farther than this are one

@@ -13,7 +13,6 @@ from scanfind.fit.polish import polish
 from scanfind.fit.refine import Refined, icp, shrinking
 from scanfind.library.near_surface import near_model
 from scanfind.pose import Pose
-from scanfind.recognition.candidate import REFUSED_SHOWN
 from scanfind.search.hypotheses import joined
 
 if TYPE_CHECKING:
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
+LOOKED_AT = 8  # poses of each model a round, whatever the coarse surfels say of them
 BATCHES = 3  # of hypotheses refined a round, each far from where those before it went
 DRIFT_CELLS = 3  # of a gate of one cell, and two that a pose may still move after the coarse steps
 ON_BEAMS_CELLS, ON_BEAMS_STEPS = 1.5, 2  # how near the surface beams end that a pose is fitted to, and how often
@@ -48,9 +48,11 @@ class Fitting:
     def refine(self, hypotheses: Hypotheses) -> Refined:
         """ICP of what is distinct among the hypotheses on the coarse surfels; of what these do not refute, the fine."""
         kept, met = self._ground.parameters.search.kept, None
+        # One good instance passes the test hundreds of times: those poses must not use up the place of the others.
+        apart = distinct(hypotheses, self._ground.arrays, self._apart_before)
+        hypotheses = self._weighing.best_drawn(hypotheses.take(apart))
         rough: list[Refined] = []
         for _ in range(BATCHES):
-            # One good instance passes the test hundreds of times: those poses must not use up the place of the others.
             batch = hypotheses.take(distinct(hypotheses, self._ground.arrays, self._apart_before, kept, 4 * kept, met))
             if not len(batch.models):
                 break
@@ -59,9 +61,9 @@ class Fitting:
             hypotheses = hypotheses.take(self._far_from(hypotheses, met))
         if met is None:
             return self.fine(hypotheses)
-        better = met.take(np.argsort(-np.concatenate([r.matched for r in rough]), kind="stable"))
+        better = self._weighing.best_fitted(met)
         better = better.take(distinct(better, self._ground.arrays, self.apart, kept, 2 * kept))
-        fine = self.fine(better.take(self._weighing.promising(better, REFUSED_SHOWN)))
+        fine = self.fine(better.take(self._weighing.promising(better, LOOKED_AT)))
         if self._weighing.lines and self._ground.parameters.refine.raw_steps:
             fine = self._on_beams(fine, self._weighing.lines.beyond_chance(fine.hypotheses) > 0.0)
         fine = fine.take(np.argsort(-fine.matched, kind="stable"))

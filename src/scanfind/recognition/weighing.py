@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import ceil
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from scanfind.recognition.candidate import Candidate
 if TYPE_CHECKING:
     from scanfind.evidence.free_space import Design
     from scanfind.evidence.rays import RayCaster
+    from scanfind.evidence.verify import Rough, VerifyParameters
     from scanfind.fit.refine import Refined
     from scanfind.recognition.ground import Ground
     from scanfind.search.hypotheses import Hypotheses
@@ -28,6 +30,8 @@ ALL_SAMPLES = 1 << 30
 # score of a shop's 96 best poses within 0.2.
 PROMISING = 0.67
 NET_PENALTY = 2.0
+# Before ICP a hypothesis may lie so many coarse cells off the scene; a beam through it counts so much against it.
+DRAWN_CELLS, ROUGH_PENALTY = 0.5, 3.0
 TOLD_BY_LINES = 12  # poses that these speak for, refined whatever the coarse surfels say
 EDGE_INLIERS = 2.0  # a laser's spot is a centimetre wide at 10 m: nearer to the outline some of it went past
 
@@ -49,6 +53,7 @@ class Weighing:
         self.fine = Level(scene.fine, tells[0], ALL_SAMPLES, inliers[0])
         self.thin = Level(scene.coarse, tells[1], ALL_SAMPLES, inliers[0])
         self._rough = Level(scene.coarse, tells[1], parameters.refine.coarse_samples, inliers[1])
+        self._drawn = self._rough._replace(inlier=DRAWN_CELLS * scene.coarse.cell)
         self._casters: dict[int, RayCaster] = {}
 
     def candidates(self, refined: Refined, *, in_place: bool = False) -> list[Candidate]:
@@ -106,20 +111,50 @@ class Weighing:
             self._casters[number] = caster_of(self._ground.models[number])
         return self._casters[number]
 
-    def promising(self, hypotheses: Hypotheses, shown: int) -> NDArray[np.intp]:
-        """Those whose evidence on the coarse surfels is not hopeless, and the best `shown` of each model (indices)."""
-        ground, verify = self._ground, self._ground.parameters.verify
-        rough = gather_rough(
-            hypotheses, ground.scene, self._rough, ground.arrays, ground.signed, verify, ground.jobs
+    def best_drawn(self, hypotheses: Hypotheses) -> Hypotheses:
+        """The same, best first, by what coarse surfels and beams say of them as they were drawn.
+
+        The test asks whether there is anything at all; of a spool of which a third shows, the best right pose was on
+        average the 36th of the distinct ones that passed it, and is the 8th so.
+        """
+        refine = self._ground.parameters.refine
+        as_icp_begins = replace(
+            self._ground.parameters.verify, gate_cells=refine.coarse_gates[0],
+            normal_agreement=refine.normal_agreement, margin_inliers=1.0,
         )  # fmt: skip
-        scores = np.array([rough_score(seen, ground.blind) for seen in rough])
+        net = [net_of(seen) for seen in self._roughly(hypotheses, self._drawn, as_icp_begins)]
+        return hypotheses.take(np.argsort(net, kind="stable")[::-1])
+
+    def best_fitted(self, hypotheses: Hypotheses) -> Hypotheses:
+        """The same, best first, by what coarse surfels and beams say of them after ICP on these."""
+        net = [net_of(seen) for seen in self._roughly(hypotheses, self._rough, self._ground.parameters.verify)]
+        return hypotheses.take(np.argsort(net, kind="stable")[::-1])
+
+    def promising(self, hypotheses: Hypotheses, least: int) -> NDArray[np.intp]:
+        """Those whose evidence on the coarse surfels is not hopeless, and the best `least` of each model (indices).
+
+        Of a part that shows little few samples speak, and what these say of the silent ones is a guess.
+        """
+        ground, verify = self._ground, self._ground.parameters.verify
+        rough = self._roughly(hypotheses, self._rough, verify)
+        scores, net = np.array([(rough_score(seen, ground.blind), net_of(seen)) for seen in rough]).reshape(-1, 2).T
         kept = scores >= PROMISING * verify.min_score
         for model in np.unique(hypotheses.models):
             theirs = np.flatnonzero(hypotheses.models == model)
-            kept[theirs[np.argsort(-scores[theirs], kind="stable")[:shown]]] = True
+            kept[theirs[np.argsort(-net[theirs], kind="stable")[:least]]] = True
         if self.lines:
             # A pose on lines is half a cell off until it is fitted to beams, and looks worse than it is.
             told = self.lines.beyond_chance(hypotheses)
             best = np.argsort(-told, kind="stable")[:TOLD_BY_LINES]
             kept[best[told[best] > 0.0]] = True
         return np.flatnonzero(kept)
+
+    def _roughly(self, hypotheses: Hypotheses, level: Level, verify: VerifyParameters) -> list[Rough]:
+        """What a level of coarse surfels and the depth maps say of each."""
+        ground = self._ground
+        return gather_rough(hypotheses, ground.scene, level, ground.arrays, ground.signed, verify, ground.jobs)
+
+
+def net_of(seen: Rough) -> float:
+    """Share of samples that are on the coarse surfels, less that of what beams passed through, by its weight."""
+    return (seen.supported - ROUGH_PENALTY * seen.seen_through) / seen.samples
