@@ -61,9 +61,8 @@ WHY = {
     ),
     "clutter": ("As for density: in the hall the part has 643 points at a ratio of 500."),
     "completeness": (
-        "At 0.3 a straight run is left of the spool, 16 to 18 % of its surface. Its right pose would be believed "
-        "(tuning seeds: 0.93 to 0.95), but of the 600 hypotheses a round that pass the test then, the few right ones "
-        "are supported no better than others and are not refined."
+        "What is left is straight runs of pipe, and an elbow at most: each lies as well on other pipes. Of the right "
+        "poses few are drawn, and those that slide along the run are not drawn back."
     ),
     "effectiveness ratio": (
         "Beside the right one another spool of the shop is reported, of which the scan shows the legs that "
