@@ -317,7 +317,7 @@ def spread(through: int, hidden: int, silent: int) -> int:
 
 
 def distinct(
-    hypotheses: Hypotheses, arrays: ModelArrays, apart: Floats, most: float = np.inf, in_all: float = np.inf,
+    hypotheses: Hypotheses, arrays: ModelArrays, apart: Floats, most: int | None = None, in_all: int | None = None,
     known: Hypotheses | None = None,
 ) -> NDArray[np.intp]:  # fmt: skip
     """The first of each group of poses that nearly coincide (indices), at most `most` of each model and `in_all`.
@@ -327,23 +327,16 @@ def distinct(
 
     Thousands of poses that roll about a straight pipe pass the sequential test; one of each group is refined.
     """
-    kept: list[int] = []
-    near: dict[int, list[Floats]] = {}
-    if known is not None:
-        for model, outline in zip(known.models.tolist(), outlines(known, arrays), strict=True):
-            near.setdefault(model, []).append(outline)
-    taken = dict.fromkeys(range(len(apart)), 0)
-    for k, outline in enumerate(outlines(hypotheses, arrays)):
-        model = int(hypotheses.models[k])
-        if len(kept) >= in_all:
-            break
-        met = near.setdefault(model, [])
-        if taken[model] >= most or (met and (distances(outline, np.array(met)) < apart[model]).any()):
-            continue
-        met.append(outline)
-        taken[model] += 1
-        kept.append(k)
-    return np.array(kept, np.intp)
+    from scanfind.kernels.apart import first_apart
+
+    every = len(hypotheses.models)
+    met = known if known is not None else hypotheses.take(np.empty(0, np.intp))
+    kept = np.empty(every, np.int64)
+    count = first_apart(
+        outlines(hypotheses, arrays), hypotheses.models, apart, outlines(met, arrays), met.models,
+        every if most is None else most, every if in_all is None else in_all, kept,
+    )  # fmt: skip
+    return kept[:count]
 
 
 def outlines(hypotheses: Hypotheses, arrays: ModelArrays) -> Floats:

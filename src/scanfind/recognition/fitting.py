@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 LOOKED_AT = 8  # poses of each model a round, whatever the coarse surfels say of them
+MOST_AT_ONCE = 192  # poses of all models fitted to coarse surfels together; half as many to fine ones
 BATCHES = 3  # of hypotheses refined a round, each far from where those before it went
 DRIFT_CELLS = 3  # of a gate of one cell, and two that a pose may still move after the coarse steps
 ON_BEAMS_CELLS, ON_BEAMS_STEPS = 1.5, 2  # how near the surface beams end that a pose is fitted to, and how often
@@ -53,7 +54,7 @@ class Fitting:
         hypotheses = self._weighing.best_drawn(hypotheses.take(apart))
         rough: list[Refined] = []
         for _ in range(BATCHES):
-            batch = hypotheses.take(distinct(hypotheses, self._ground.arrays, self._apart_before, kept, 4 * kept, met))
+            batch = hypotheses.take(distinct(hypotheses, self._ground.arrays, self._apart_before, kept, MOST_AT_ONCE, met))
             if not len(batch.models):
                 break
             rough.append(self.coarse(batch))
@@ -62,13 +63,13 @@ class Fitting:
         if met is None:
             return self.fine(hypotheses)
         better = self._weighing.best_fitted(met)
-        better = better.take(distinct(better, self._ground.arrays, self.apart, kept, 2 * kept))
+        better = better.take(distinct(better, self._ground.arrays, self.apart, kept, MOST_AT_ONCE // 2))
         fine = self.fine(better.take(self._weighing.promising(better, LOOKED_AT)))
         if self._weighing.lines and self._ground.parameters.refine.raw_steps:
             fine = self._on_beams(fine, self._weighing.lines.beyond_chance(fine.hypotheses) > 0.0)
         fine = fine.take(np.argsort(-fine.matched, kind="stable"))
         # What ended at one place is asked once.
-        return fine.take(distinct(fine.hypotheses, self._ground.arrays, self._the_same, kept, 2 * kept))
+        return fine.take(distinct(fine.hypotheses, self._ground.arrays, self._the_same, kept, MOST_AT_ONCE // 2))
 
     def _on_beams(self, refined: Refined, some: NDArray[np.bool_]) -> Refined:
         """Refined poses, some of them (H,) fitted to where beams ended that went towards them.
