@@ -54,7 +54,8 @@ class Fitting:
         hypotheses = self._weighing.best_drawn(hypotheses.take(apart))
         rough: list[Refined] = []
         for _ in range(BATCHES):
-            batch = hypotheses.take(distinct(hypotheses, self._ground.arrays, self._apart_before, kept, MOST_AT_ONCE, met))
+            some = distinct(hypotheses, self._ground.arrays, self._apart_before, kept, MOST_AT_ONCE, met)
+            batch = hypotheses.take(some)
             if not len(batch.models):
                 break
             rough.append(self.coarse(batch))

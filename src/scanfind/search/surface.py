@@ -101,7 +101,7 @@ class SearchParameters:
     tests: int = 192
     chance_overlap: float = 0.15
     test_cells_across: float = 45.0
-    kept: int = 16
+    kept: int = 32
 
     def __post_init__(self) -> None:
         require(0.0 < self.overlap_ratio <= 1.0, "overlap_ratio", self.overlap_ratio, "above 0 and at most 1")
