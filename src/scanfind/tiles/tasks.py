@@ -15,17 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.clock import Clock
+from scanfind.design.elements import placements_of
 from scanfind.detection import Detection, IsolatedPoints, Refused, SceneScan
 from scanfind.dimensions import plan_of
 from scanfind.errors import InvalidGeometryError, UnreadableFileError, UnsupportedFormatError
-from scanfind.find import recognise
+from scanfind.find import begin, recognise
 from scanfind.grid.moments import MomentGrid
 from scanfind.grid.scene import first_cell
 from scanfind.isolation.isolate import IsolateParameters, Isolator, Placed, joined, pieces_of
 from scanfind.library.near_surface import near_model
 from scanfind.parameters import Parameters
 from scanfind.pose import Pose
+from scanfind.priors.allowed import middle_of
 from scanfind.recognition.candidate import Standing
+from scanfind.recognition.in_place import AROUND_MOST_M, Asked, design_of
 from scanfind.recognition.sizes import Size, Sizes, by_size
 from scanfind.scans.sources import Scan, source_of
 from scanfind.tiles.plan import BASE_BYTES, RIM, Tile, bin_metres, margin_of
@@ -33,6 +36,7 @@ from scanfind.tiles.stored import Store, beams_into, count_in, parts_of, rows_in
 
 if TYPE_CHECKING:
     from scanfind.dimensions import Plan
+    from scanfind.evidence.free_space import Design, Limits
     from scanfind.kernels.distance import NearSurface
     from scanfind.library.model import Model
     from scanfind.search.surface import Tally
@@ -51,6 +55,7 @@ class Job:
     cell, offset : of every grid; blocks : log2 of the blocks along a bin's edge
     memory : bytes a worker may take; jobs : its threads
     box : (2, 3) in which points are kept, scans' frame, metres; None: everywhere
+    at_design : models are tried where the design has them, see `find`
     """
 
     folder: Path
@@ -63,6 +68,7 @@ class Job:
     seed: int
     origin: tuple[float, float, float] | None = None
     box: NDArray[np.float64] | None = None
+    at_design: bool = False
 
     def grid(self) -> MomentGrid:
         """An empty one."""
@@ -78,7 +84,9 @@ class Job:
 
     def margin(self, models: Sequence[Model]) -> int:
         """How many bins around a tile the search for some models needs."""
-        return ceil(margin_of(models) / self.bin_m())
+        # What is beside its place in the design is its owner's all the same.
+        beside = AROUND_MOST_M if self.at_design else 0.0
+        return ceil((margin_of(models) + beside) / self.bin_m())
 
 
 class Summed(NamedTuple):
@@ -96,6 +104,8 @@ class Searched(NamedTuple):
 
     noise, cell, reach : of the search, metres
     tally : how it went, for each model
+    limits : when a beam is on a surface here, beside it or through
+    by_design : the ids of those that trying where the design puts them led to
     """
 
     detections: list[Detection]
@@ -105,6 +115,8 @@ class Searched(NamedTuple):
     cell: float
     reach: float
     tally: Tally
+    limits: Limits
+    by_design: frozenset[int]
 
 
 class Cut(NamedTuple):
@@ -123,12 +135,36 @@ class Found(NamedTuple):
     scene_from_model: Pose
 
 
+class Owned(NamedTuple):
+    """Of a design what is a tile's own: the elements whose middle it puts there.
+
+    places : by name of a model, the numbers of its placements
+    others : by name, how many more of it are wanted, see Asked
+    only : nothing else is looked for
+    """
+
+    places: Mapping[str, Sequence[int]]
+    others: Mapping[str, int]
+    only: bool
+
+    def asked(self, job: Job, models: Sequence[Model]) -> Asked:
+        """What to try in the tile."""
+        places = {model.name: [placements_of(model)[k] for k in self.places.get(model.name, ())] for model in models}
+        return Asked(places, self.others, design_in(job.folder))
+
+
 @lru_cache(maxsize=2)
 def models_in(folder: Path) -> list[Model]:
     """The models of a run."""
     with (folder / "models").open("rb") as file:
         models: list[Model] = pickle.load(file)
     return models
+
+
+@lru_cache(maxsize=2)
+def design_in(folder: Path) -> Design | None:
+    """All elements of a design in their places, made ready for beams once a worker."""
+    return design_of(models_in(folder))
 
 
 @lru_cache(maxsize=256)
@@ -178,36 +214,59 @@ def count(folder: Path, parts: Sequence[Path], bins: NDArray[np.int64]) -> NDArr
 
 def search(
     folder: Path, job: Job, group: int, tile: Tile, standing: Sequence[Found], reach: float, signed: bool,
-    scans: Sequence[Path], learnt: Sequence[float], deeper: bool,
+    scans: Sequence[Path], learnt: Sequence[float], deeper: bool, owned: Owned | None = None,
 ) -> Searched:  # fmt: skip
     """Search a tile, with its margin, for the models of one size.
 
     standing : instances of larger models; reach : how far from their surface their points may lie, metres
     scans : the folders of those summed up
     learnt : see Search; deeper : see SearchParameters
+    owned : where a design has models in this tile, to be tried first; None: nobody asks
     """
     models = by_size(job.models())[group]
     # How many there are of the whole site says nothing of a tile.
     limits, priors = job.parameters.search, replace(job.parameters.priors, expect=None)
     own = replace(job.parameters, search=replace(limits, max_instances=None, deeper=deeper), priors=priors)
     grid = grid_of(job, models, tile, signed, scans)
-    taken = [Standing(surface_of(job.folder, one.model, reach), one.scene_from_model) for one in standing]
-    found = Sizes(models, own)
-    search = recognise(
-        Size(models, 0, 1), grid, taken, own, job.seed, job.jobs, Clock(), _silent, at_design=False, learnt=learnt
-    )
+    taken = [
+        Standing(surface_of(job.folder, one.model, reach), one.scene_from_model)
+        for one in standing
+        if touches(job, tile.grown(job.margin(models)), one)
+    ]
+    if owned is not None and not grid.points:  # of what the design has where no scan was made beams tell
+        owned = owned._replace(places={})
+    asked = None if owned is None else owned.asked(job, models)
+    size, found = Size(models, 0, 1), Sizes(models, own)
+    if owned is not None and owned.only:
+        search = begin(size, grid, taken, own, job.seed, job.jobs, Clock(), asked, learnt)
+    else:
+        search = recognise(size, grid, taken, own, job.seed, job.jobs, Clock(), _silent, asked, learnt)
     found.add(search)
-    middles = {model.name: model.samples.points.mean(axis=0) for model in models}
     diameters = {model.name: model.diameter for model in models}
+    detections, tried = found.detections(), {search.telling.pose(one).translation.tobytes() for one in search.by_design}
+    by_design = frozenset(one.id for one in detections if one.scene_from_model.translation.tobytes() in tried)
 
     def near(one: Detection | Refused) -> bool:
-        middle = one.scene_from_model.move(middles[one.model][None])[0] - job.offset
-        return tile.has(middle, job.bin_m(), RIM * diameters[one.model])
+        return tile.has(middle_in(job, one.model, one.scene_from_model), job.bin_m(), RIM * diameters[one.model])
 
+    notes = found.notes() if grid.points else []
     return Searched(
-        [one for one in found.detections() if near(one)], [one for one in found.refused() if near(one)], found.notes(),
-        found.noise(), found.cell(), search.reach(), search.search.tally(),
+        [one for one in detections if one.id in by_design or near(one)],
+        [one for one in found.refused() if near(one)], notes, found.noise(), found.cell(), search.reach(),
+        search.search.tally(), search.weighing.witnesses.limits, by_design,
     )  # fmt: skip
+
+
+def middle_in(job: Job, name: str, pose: Pose) -> NDArray[np.float64]:
+    """Where the middle of a placed model is, (3,), metres from the grid's offset."""
+    model = next(model for model in job.models() if model.name == name)
+    return np.asarray(pose.move(middle_of(model)[None])[0] - job.offset)
+
+
+def touches(job: Job, box: Tile, one: Found) -> bool:
+    """May an instance reach into a box?"""
+    model = next(model for model in job.models() if model.name == one.model)
+    return box.has(middle_in(job, one.model, one.scene_from_model), job.bin_m(), margin_of([model]))
 
 
 def grid_of(job: Job, models: Sequence[Model], tile: Tile, signed: bool, scans: Sequence[Path]) -> MomentGrid:
@@ -249,15 +308,17 @@ def cell_of(job: Job, models: Sequence[Model]) -> tuple[float, int]:
 def own(searched: Mapping[Tile, Searched], job: Job) -> list[Detection]:
     """The detections of all tiles, each instance once, in the order of the tiles.
 
-    Of two tiles that tell the same instance the one in whose half-open box its middle lies is believed.
+    Of two tiles that tell the same instance the one is believed that tried it where the design puts it, or else the
+    one in whose half-open box its middle lies.
     """
     every = [(tile, one) for tile, found in sorted(searched.items()) for one in found.detections]
     mine = {id(one): tile.has(np.array(one.pivot) - job.offset, job.bin_m()) for tile, one in every}
+    tried = {id(one): one.id in searched[tile].by_design for tile, one in every}
     diameters = {model.name: model.diameter for model in job.models()}
     kept: list[tuple[Tile, Detection]] = []
-    for tile, one in sorted(every, key=lambda pair: not mine[id(pair[1])]):
+    for tile, one in sorted(every, key=lambda pair: (not tried[id(pair[1])], not mine[id(pair[1])])):
         middle, rim = np.array(one.pivot), RIM * diameters[one.model]
-        if not any(
+        if tried[id(one)] or not any(
             other.model == one.model and there != tile and np.linalg.norm(np.array(other.pivot) - middle) < rim
             for there, other in kept
         ):
