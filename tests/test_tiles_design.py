@@ -8,13 +8,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
+from scanfind.assembly.parameters import AssemblyParameters
+from scanfind.cli import main
 from scanfind.cloud import PointCloud
 from scanfind.design.elements import INSTALLED, NO_DATA, OCCLUDED, UNCERTAIN
 from scanfind.detection import Findings
+from scanfind.errors import UsageError
 from scanfind.find import find
+from scanfind.inspect import inspect
 from scanfind.mesh import Mesh, Placement
 from scanfind.pose import Pose
+from scanfind.results import read_results
+from scanfind.scans import open_stations
 from scanfind.simulate.parts import blocks, cylinder
 from scanfind.simulate.scanner import Scanner, scan
 from scanfind.simulate.scene import Scene, SceneObject
@@ -35,6 +42,8 @@ PLACES = (at(0, 0), at(6, 0), at(12, 0, 0, 0.3), at(18, 0), at(3, 1.5, 0, 1.0), 
 BUILT = (at(0, 0), at(6.02, 0.02, 0.01), at(14.9, 2.2, 0, 2.0), at(18, 0), at(3, 1.5, 0, 1.0))
 STATUSES = [INSTALLED, INSTALLED, UNCERTAIN, OCCLUDED, INSTALLED, NO_DATA]
 ROWS_A_TILE = 250_000
+# A bracket that is missed with a chance of a fifth is found here nevertheless, and the others are missed sooner.
+SHORT = replace(QUICK, search=replace(QUICK.search, miss_probability=0.2))
 
 
 def designed(*places: Pose) -> Mesh:
@@ -54,7 +63,7 @@ def site() -> list[PointCloud]:
 
 @cache
 def whole() -> Findings:
-    return find(site(), designed(*PLACES), parameters=QUICK, at_design=True)
+    return find(site(), designed(*PLACES), parameters=SHORT, at_design=True)
 
 
 def in_tiles(rows: int, work: Path, *places: Pose) -> Findings:
@@ -62,7 +71,7 @@ def in_tiles(rows: int, work: Path, *places: Pose) -> Findings:
     memory = BASE_BYTES + len(site()) * STATION_BYTES + ROW_BYTES * rows
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(planned, "ROWS_A_SQUARE_CELL", 1.0)
-        return find_in_tiles(site(), designed(*places), parameters=QUICK, memory=memory, at_design=True, work=work)
+        return find_in_tiles(site(), designed(*places), parameters=SHORT, memory=memory, at_design=True, work=work)
 
 
 @pytest.mark.slow
@@ -97,3 +106,31 @@ def test_where_all_stand_in_their_places_no_tile_is_searched(tmp_path: Path) -> 
     assert sorted(element.detection or 0 for element in found.elements) == [1, 2, 3, 4]
     assert len(list(tmp_path.glob("*/place-*"))) > 2
     assert not list(tmp_path.glob("*/search-*"))
+
+
+@pytest.mark.slow
+def test_processes_inspect_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SCANFIND_GRID_CELL_M", "0.02")
+    scans, designs, out = [], [], tmp_path / "out"
+    for k, cloud in enumerate(site()):
+        assert cloud.origin is not None
+        scans.append(str(tmp_path / f"{k}.e57"))
+        with open_stations(Path(scans[-1]), {}) as writer:
+            writer.station(f"{k}", Pose(np.eye(3), cloud.origin), (1, 1))
+            writer.write(cloud.xyz, {})
+    for k in (0, 1, 4):
+        designs.append(str(tmp_path / f"bracket{k}.ply"))
+        trimesh.Trimesh(PLACES[k].move(BRACKET.vertices), BRACKET.faces, process=False).export(designs[-1])
+    asked = ["inspect", *scans, "--design", *designs, "--memory", "1500MB", "--workers", "2", "--out", str(out)]
+    assert main(asked) == 0
+    told = read_results(out)
+    assert [element.status for element in told.elements] == [INSTALLED] * 3
+    off = [element.off_m for element in told.elements]
+    np.testing.assert_allclose(np.array(off, float), [0.0, 0.03, 0.0], atol=0.001)
+    assert not out.with_name("out.scanfind-work").exists()
+
+
+def test_what_cannot_be_combined_is_refused() -> None:
+    parts = replace(QUICK, assembly=AssemblyParameters(parts=True))
+    with pytest.raises(UsageError, match="parts are not fitted in tiles"):
+        inspect([np.zeros((9, 3))], BRACKET, parameters=parts, search=find_in_tiles)

@@ -53,18 +53,10 @@ from scanfind.tiles.plan import (
     words,
 )
 from scanfind.tiles.points import isolate_all, write_remainder
+from scanfind.tiles.search import Searched, cell_of, own
 from scanfind.tiles.stored import parts_of, reached_from, stored_bins
 from scanfind.tiles.sweep import search_all
-from scanfind.tiles.tasks import (
-    Found,
-    Job,
-    Searched,
-    Summed,
-    cell_of,
-    count,
-    own,
-    sum_up,
-)
+from scanfind.tiles.tasks import Found, Job, Summed, count, sum_up
 from scanfind.tiles.told import all_told
 from scanfind.tiles.work import Crew, Here, Workers, all_done, no_room, opened
 

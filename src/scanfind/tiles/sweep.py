@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from scanfind.design.elements import placements_of
 from scanfind.search.surface import LEARNT, RIGHT_PAIR_FINDS, Tally
 from scanfind.tiles.plan import Held, Tile, tiles_of
-from scanfind.tiles.tasks import Found, Job, Owned, Searched, cell_of, middle_in, own, search
+from scanfind.tiles.search import Owned, Searched, cell_of, middle_in, own, search
+from scanfind.tiles.tasks import Found, Job
 from scanfind.tiles.work import Crew, all_done
 
 if TYPE_CHECKING:

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scanfind.design.elements import assigned, elements_of, placements_of
 from scanfind.recognition.sizes import by_size
 from scanfind.recognition.witnesses import Witnesses
+from scanfind.tiles.search import middle_in
 from scanfind.tiles.stored import beams_into, parts_of
-from scanfind.tiles.tasks import design_in, middle_in
+from scanfind.tiles.tasks import design_in
 from scanfind.tiles.work import Crew, all_done
 
 if TYPE_CHECKING:
@@ -28,7 +29,8 @@ if TYPE_CHECKING:
     from scanfind.library.model import Model
     from scanfind.pose import Pose
     from scanfind.tiles.plan import Tile
-    from scanfind.tiles.tasks import Job, Searched
+    from scanfind.tiles.search import Searched
+    from scanfind.tiles.tasks import Job
 
 Floats = NDArray[np.float64]
 
