@@ -491,3 +491,12 @@ def test_a_part_on_a_floor_is_never_found_sunk_into_it() -> None:
             metres, radians = found.scene_from_model.difference(place)
             assert metres < 0.02, found
             assert radians < np.radians(1.0), found
+
+
+def test_a_bare_floor_holds_nothing() -> None:
+    """What of a model lies flush with the only surface there is tells nothing."""
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(-2, 2, (200_000, 2)), rng.normal(0.0, 0.002, 200_000)])
+    # It is long until nothing can have been missed; without telling shapes some were found at once.
+    soon = replace(ONE, search=replace(ONE.search, time_limit_s=3.0))
+    assert not seek(PointCloud(floor, origin=np.array([0.0, 0.0, 1.5])), soon)

@@ -14,7 +14,7 @@ from scanfind.grid.scene import build_scene
 from scanfind.library import joint_table
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.priors.allowed import box_searched, require_points_in
-from scanfind.recognition.in_place import design_of
+from scanfind.recognition.in_place import asked_of
 from scanfind.recognition.recognise import Recognition
 from scanfind.recognition.sizes import Sizes
 from scanfind.scans.sources import Scan, Sources, require_points
@@ -32,9 +32,9 @@ from scanfind.threads import available_cores
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from scanfind.evidence.free_space import Design
     from scanfind.progress import Progress
     from scanfind.recognition.candidate import Standing
+    from scanfind.recognition.in_place import Asked
     from scanfind.recognition.sizes import Size
     from scanfind.scans import CloudWriter
 
@@ -94,13 +94,9 @@ def find(
         grid.release()
         require_points_in(box, grid.points, grid.offset)
 
-    design = design_of(library) if at_design else None
+    asked = asked_of(library) if at_design else None
     for size in found.groups():  # large models first, each size at its own resolution
-        found.add(
-            recognise(
-                size, grid, found.standing(), parameters, seed, jobs, clock, tell, at_design=at_design, design=design
-            )
-        )
+        found.add(recognise(size, grid, found.standing(), parameters, seed, jobs, clock, tell, asked))
     del grid
     tell("search", 1.0, 1.0)
 
@@ -145,24 +141,14 @@ def find(
 
 def recognise(
     size: Size, grid: MomentGrid, standing: Sequence[Standing], parameters: Parameters, seed: int, jobs: int,
-    clock: Clock, tell: Progress, *, at_design: bool, design: Design | None = None, learnt: Sequence[float] = (),
+    clock: Clock, tell: Progress, asked: Asked | None = None, learnt: Sequence[float] = (),
 ) -> Recognition:  # fmt: skip
     """The search for models of one size: what is believed of them, and why (paper 3.3 and 3.4).
 
-    standing : instances of larger models; at_design : try them where the design has them first; design : all of it
+    standing : instances of larger models; asked : where the design has models, to be tried there first
     learnt : of each model, how many of the right pairs found it in other parts of the site, see Search
     """
-    with clock("grid"):
-        smallest = min(model.diameter for model in size.models)
-        scene = build_scene(grid, smallest, parameters.grid, parameters.search.test_cells_across, jobs)
-    with clock("library"):
-        table = joint_table(size.models, each_once=parameters.search.each_once)
-    found = Recognition(scene, size.models, table, parameters, seed, jobs, standing, design, learnt)
-    for hypotheses in found.at_design() if at_design else ():
-        with clock("refine"):
-            poses = found.refine_in_place(hypotheses)
-        with clock("verify"):
-            found.believe_in_place(poses)
+    found = begin(size, grid, standing, parameters, seed, jobs, clock, asked, learnt)
     while found.wants_more(clock.elapsed("search", "refine", "verify") / size.patience):
         tell("search", size.progress(found.progress()), 1.0)
         with clock("search"):
@@ -171,4 +157,23 @@ def recognise(
             poses = found.refine(hypotheses)  # 3.4 post-ICP
         with clock("verify"):
             found.believe(hypotheses, poses)  # support, penalty, conflicts (Papazov & Burschka 2010)
+    return found
+
+
+def begin(
+    size: Size, grid: MomentGrid, standing: Sequence[Standing], parameters: Parameters, seed: int, jobs: int,
+    clock: Clock, asked: Asked | None = None, learnt: Sequence[float] = (),
+) -> Recognition:  # fmt: skip
+    """The same search before its first round: the scene, the pairs, and what stands where the design has it."""
+    with clock("grid"):
+        smallest = min(model.diameter for model in size.models)
+        scene = build_scene(grid, smallest, parameters.grid, parameters.search.test_cells_across, jobs)
+    with clock("library"):
+        table = joint_table(size.models, each_once=parameters.search.each_once)
+    found = Recognition(scene, size.models, table, parameters, seed, jobs, standing, asked, learnt)
+    for hypotheses in found.at_design():
+        with clock("refine"):
+            poses = found.refine_in_place(hypotheses)
+        with clock("verify"):
+            found.believe_in_place(poses)
     return found

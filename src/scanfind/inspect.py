@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from os import PathLike
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Protocol
 
 from scanfind.design.alignment import CELL_M, fitted, lies_at
 from scanfind.design.elements import INSTALLED, installed, placements_of
@@ -35,6 +35,18 @@ if TYPE_CHECKING:
     from scanfind.tolerances import Profile
 
 
+class Searches(Protocol):
+    """What searches scans: `find`, or `find_in_tiles` with its memory and workers given (functools.partial)."""
+
+    def __call__(
+        self, scans: Scan | Sequence[Scan], models: ModelInput | Sequence[ModelInput], /, *, parameters: Parameters,
+        seed: int, jobs: int | None, origin: ArrayLike | None, progress: Progress | None, isolate: bool,
+        at_design: bool,
+    ) -> Findings:  # fmt: skip
+        """As `find`."""
+        ...
+
+
 def inspect(
     scans: Scan | Sequence[Scan],
     design: ModelInput | Sequence[ModelInput],
@@ -49,6 +61,7 @@ def inspect(
     align: Literal["auto", "always", "never"] = "auto",
     upright: bool = False,
     allowed: float | str | PathLike[str] | Profile | None = None,
+    search: Searches = find,
 ) -> Findings:
     """Say of every element of a design what became of it: see `Findings.elements`.
 
@@ -60,6 +73,7 @@ def inspect(
         upright : up is the same in design and scans
         allowed : by how much elements may be off, metres, or a tolerance profile, its file or a preset's name: gives
             installed elements a verdict
+        search : what searches; for a large site `functools.partial(find_in_tiles, memory=…)`
 
     `Findings.alignment` says where the design lies if that had to be found; elements are then where it puts them.
 
@@ -77,9 +91,9 @@ def inspect(
 
     def found(placed: Sequence[Model], *, at_design: bool = True, isolate: bool = True) -> Findings:
         with library_of(placed) as library:
-            return find(
+            return search(
                 scans, library, parameters=parameters, seed=seed, jobs=jobs, origin=origin, progress=progress,
-                at_design=at_design, isolate=isolate,
+                isolate=isolate, at_design=at_design,
             )  # fmt: skip
 
     findings = found(models, at_design=align != "always", isolate=align != "always")

@@ -160,7 +160,7 @@ def find(
         raise UsageError(msg)
 
     from scanfind.cli.inputs import expected, open_models
-    from scanfind.cli.tiled import Tiled
+    from scanfind.cli.tiled import Tiled, ending_workers
     from scanfind.config import load_settings
     from scanfind.find import find as find_models
     from scanfind.parameters import PRESETS
@@ -186,13 +186,12 @@ def find(
         rest = folder / f"remainder.{run.format}" if folder is not None and remainder else None
         readable = files if tiled is None else tiled.readable(files)
         sink = None if rest is None else stack.enter_context(open_remainder(rest, readable))
-        if tiled is None:
-            findings = find_models(
-                files, models, parameters=parameters, seed=run.seed, jobs=run.jobs, origin=run.origin,
-                progress=progress, remainder=sink,
-            )  # fmt: skip
-        else:
-            findings = tiled.find(files, models, run, parameters, progress, sink)
+        stack.enter_context(ending_workers())
+        search = find_models if tiled is None else tiled.search()
+        findings = search(
+            files, models, parameters=parameters, seed=run.seed, jobs=tiled.threads(run.jobs) if tiled else run.jobs,
+            origin=run.origin, progress=progress, remainder=sink,
+        )  # fmt: skip
         results = results_of(findings, folder, models, run, parameters, progress, remainder=rest.name if rest else None)
     if tiled is not None:
         tiled.finished()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from scanfind.cli.options import Box, Count, Flag, Format, Metres, Names, Paths, Position, Seconds, Units, note, say
-from scanfind.cli.outputs import NOT_AS_WANTED, results_of
+from scanfind.cli.outputs import NOT_AS_WANTED, SCANS_MISSING, results_of
 from scanfind.errors import UsageError
 
 if TYPE_CHECKING:
@@ -40,6 +40,10 @@ def inspect(
     align: Literal["auto", "always", "never"] = "auto",
     upright: Flag = False,
     fail_on: Literal["not-found", "out-of-tolerance"] | None = None,
+    memory: str | None = None,
+    workers: Count | None = None,
+    scheduler: str | None = None,
+    resume: Flag = False,
 ) -> int:
     """Say what became of every element of a design: is it there, and how far from where it should be?
 
@@ -50,6 +54,7 @@ def inspect(
 
         scanfind inspect shop.e57 --design steel.ifc --allowed 0.01 --out inspected
         scanfind inspect shop.e57 --design steel.ifc --allowed structural-steel --upright
+        scanfind inspect setups/ --design steel.ifc --memory 3GB --out inspected
 
     Parameters
     ----------
@@ -95,6 +100,14 @@ def inspect(
         Up is the same in the scans and the design: no other way to align them is thought of.
     fail_on
         Exit with 3 if some element was not found, or is not found or out of tolerance.
+    memory
+        Inspect in tiles that fit a memory such as 3GB, of all workers together; a scan that cannot be read is left out.
+    workers
+        Inspect in tiles, with so many processes.
+    scheduler
+        Inspect in tiles, on the dask cluster of this address (tcp://...); --memory is then that of each worker.
+    resume
+        Go on with an inspection in tiles that ended early; what it had done lies beside --out.
 
     """
     if fail_on == "out-of-tolerance" and allowed is None:
@@ -102,7 +115,9 @@ def inspect(
         raise UsageError(msg)
 
     from scanfind.cli.inputs import open_models
+    from scanfind.cli.tiled import Tiled, ending_workers
     from scanfind.config import load_settings
+    from scanfind.find import find
     from scanfind.inspect import inspect as inspect_scans
     from scanfind.parameters import PRESETS
     from scanfind.progress import progress_on
@@ -115,18 +130,25 @@ def inspect(
         "priors.region": region, "priors.near_design_m": near_design,
     }  # fmt: skip
     run, parameters = load_settings(PRESETS, flags, config)
+    tiled = Tiled.asked(memory, workers, scheduler, out, resume=resume)
     profile = None if allowed is None else profile_allowing(allowed)  # before the search: it may be misspelt
     with ExitStack() as stack:
         folder = None if out is None else stack.enter_context(result_folder(out, overwrite=overwrite))
         models = stack.enter_context(open_models(design, None, run, parameters))
         progress = stack.enter_context(progress_on())
+        stack.enter_context(ending_workers())
         findings = inspect_scans(
-            scans, models, parameters=parameters, seed=run.seed, jobs=run.jobs, origin=run.origin,
-            progress=progress, align=align, upright=upright, allowed=profile,
+            scans, models, parameters=parameters, seed=run.seed, jobs=tiled.threads(run.jobs) if tiled else run.jobs,
+            origin=run.origin, progress=progress, align=align, upright=upright, allowed=profile,
+            search=tiled.search() if tiled else find,
         )  # fmt: skip
         results = results_of(findings, folder, models, run, parameters, progress)
+    if tiled is not None:
+        tiled.finished()
     report(results, out, json=json)
-    return NOT_AS_WANTED if fail_on and failed(results, fail_on) else 0
+    if fail_on and failed(results, fail_on):
+        return NOT_AS_WANTED
+    return SCANS_MISSING if findings.missing else 0
 
 
 def report(results: Results, out: Path | None, *, json: bool) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -11,12 +13,7 @@ from scanfind.cli.options import note
 from scanfind.errors import Interrupted, UsageError
 
 if TYPE_CHECKING:
-    from scanfind.config import Run
     from scanfind.detection import Findings
-    from scanfind.library import ModelLibrary
-    from scanfind.parameters import Parameters
-    from scanfind.progress import Progress
-    from scanfind.scans import CloudWriter
 
 
 class Tiled(NamedTuple):
@@ -40,13 +37,13 @@ class Tiled(NamedTuple):
         if memory is None and workers is None and scheduler is None and not resume:
             return None
         if workers is not None and scheduler is not None:
-            msg = "find: --workers and --scheduler exclude each other: a cluster has its own workers"
+            msg = "--workers and --scheduler exclude each other: a cluster has its own workers"
             raise UsageError(msg)
         if workers is not None and workers < 1:
-            msg = f"find: --workers is 1 or more, got {workers}"
+            msg = f"--workers is 1 or more, got {workers}"
             raise UsageError(msg)
         if resume and out is None:
-            msg = "find: --resume has nothing to go on with: give the --out DIR the search began with"
+            msg = "--resume has nothing to go on with: give the --out DIR the search began with"
             raise UsageError(msg)
         from scanfind.tiles import MEMORY
         from scanfind.tiles.plan import size_of
@@ -61,14 +58,8 @@ class Tiled(NamedTuple):
 
         return [scan for number, scan in enumerate(scans) if info_of(scan, number) is not None]
 
-    def find(
-        self, scans: Sequence[Path], models: ModelLibrary, run: Run, parameters: Parameters, progress: Progress,
-        remainder: CloudWriter | None,
-    ) -> Findings:  # fmt: skip
-        """Search."""
-        from multiprocessing import active_children
-
-        from scanfind.threads import available_cores
+    def search(self) -> Callable[..., Findings]:
+        """`find_in_tiles` as it was asked for."""
         from scanfind.tiles import find_in_tiles
         from scanfind.tiles.workers import cluster, processes
 
@@ -77,19 +68,30 @@ class Tiled(NamedTuple):
             executor = cluster(self.scheduler)
         elif self.workers is not None:
             executor = processes(self.workers)
-        try:
-            return find_in_tiles(
-                scans, models, executor=executor, memory=self.memory, work=self.work, resume=self.resume,
-                parameters=parameters, seed=run.seed, jobs=run.jobs or max(1, available_cores() // (self.workers or 1)),
-                origin=run.origin, progress=progress, remainder=remainder, say=note,
-            )  # fmt: skip
-        except (Interrupted, KeyboardInterrupt):
-            # Else Python waits for what workers are at, a minute or more.
-            for worker in active_children():
-                worker.terminate()
-            raise
+        return partial(
+            find_in_tiles, executor=executor, memory=self.memory, work=self.work, resume=self.resume, say=note
+        )
+
+    def threads(self, jobs: int | None) -> int:
+        """Of each worker: so many, or its share of the cores."""
+        from scanfind.threads import available_cores
+
+        return jobs or max(1, available_cores() // (self.workers or 1))
 
     def finished(self) -> None:
         """The result is written: what was kept on the way goes."""
         if self.work is not None:
             shutil.rmtree(self.work, ignore_errors=True)
+
+
+@contextmanager
+def ending_workers() -> Iterator[None]:
+    """Where a run is interrupted its workers end at once: else Python waits for what they are at, a minute or more."""
+    from multiprocessing import active_children
+
+    try:
+        yield
+    except (Interrupted, KeyboardInterrupt):
+        for worker in active_children():
+            worker.terminate()
+        raise

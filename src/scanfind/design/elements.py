@@ -7,7 +7,7 @@ not there), `not_enough_data` (too little of it was looked at), `no_data` (no be
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -90,18 +90,18 @@ def placements_of(model: Model) -> tuple[Placement, ...]:
 
 
 def elements_of(
-    model: Model, detections: Sequence[Detection], spoken_at: Callable[[Pose], Floats], stations: Sequence[int] = ()
+    model: Model, detections: Sequence[Detection], said: Sequence[Floats], stations: Sequence[int] = ()
 ) -> list[Element]:
     """The elements of a design that are of one model, in the order of its placements.
 
     detections : in the scans' frame, which is the design's
-    spoken_at : what the beams of each of S scanners say of the model at a pose: rows as of Spoken, (S, 4), m²
+    said : for each placement, what the beams of each of S scanners say of the model there: rows as of Spoken, (S, 4)
     stations : their numbers
     """
     placements, found = placements_of(model), []
     taken = assigned(model, placements, [one for one in detections if one.model == model.name])
     for place, placement in enumerate(placements):
-        by_each, one = spoken_at(placement.design_from_model), taken.get(place)
+        by_each, one = said[place], taken.get(place)
         spoken = Spoken(*by_each.sum(axis=0).tolist()) if len(by_each) else None
         told = missed(model, placement, spoken) if one is None else installed(model, placement, one, spoken)
         found.append(replace(told, stations=said_by(by_each, stations)))

@@ -22,17 +22,21 @@ class Claims:
 
     def __init__(self, ground: Ground, claimants: Iterable[Candidate] = ()) -> None:
         self._ground, self.marked = ground, ground.no_rows()
-        for candidate in claimants:
-            self.add(candidate)
+        # All at once: each marking passes over the whole scene, and a design has hundreds of elements.
+        if some := [self._claimed(candidate) for candidate in claimants]:
+            ground.mark(np.concatenate(some), CLAIM_CELLS, self.marked)
 
     def add(self, candidate: Candidate) -> None:
-        """Mark the cells a pose claims: its samples are too few to name every cell of its surface themselves."""
-        claims, scene = candidate.evidence.claims, self._ground.scene
+        """Mark the cells a pose claims."""
+        self._ground.mark(self._claimed(candidate), CLAIM_CELLS, self.marked)
+
+    def _claimed(self, candidate: Candidate) -> NDArray[np.float64]:
+        """Points (N, 3) about which a pose claims cells: its samples are too few to name all of its surface's."""
+        claims = candidate.evidence.claims
         if len(claims):
-            self._ground.mark(scene.fine.means[claims], CLAIM_CELLS, self.marked)
-        else:  # so sparse that coarse cells and lines speak alone
-            samples = self._ground.models[candidate.model].samples.points
-            self._ground.mark(candidate.pose().move(samples), CLAIM_CELLS, self.marked)
+            return self._ground.scene.fine.means[claims]
+        # So sparse that coarse cells and lines speak alone.
+        return candidate.pose().move(self._ground.models[candidate.model].samples.points)
 
     def hold(self, candidate: Candidate) -> bool:
         """Is too much of what supports a pose claimed already?"""

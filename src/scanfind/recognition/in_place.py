@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,22 +37,40 @@ AROUND_M, AROUND_MOST_M = (-0.04, 0.0, 0.04), 0.12
 IN_PLACE_M = 0.06  # what ICP carried no farther off is still where the design puts it
 
 
+class Asked(NamedTuple):
+    """What is asked of a design before anything else is looked for.
+
+    places : by name of a model, where to try it
+    others : by name, how many more of it are wanted, wherever they stand: in tiles, those that other tiles miss
+    shadows : all elements where the design has them: what they hide is no evidence; None where it has no meshes
+    """
+
+    places: Mapping[str, Sequence[Placement]]
+    others: Mapping[str, int]
+    shadows: Design | None
+
+
+NOTHING = Asked({}, {}, None)
+
+
 class InPlace:
     """The poses a design gives, tried, and what is believed of them."""
 
-    def __init__(self, ground: Ground, fitting: Fitting, weighing: Weighing) -> None:
-        self._ground, self._fitting, self._weighing = ground, fitting, weighing
+    def __init__(self, ground: Ground, fitting: Fitting, weighing: Weighing, asked: Asked) -> None:
+        self._ground, self._fitting, self._weighing, self._asked = ground, fitting, weighing, asked
         self._places: list[Placement] = []
 
     def wanted(self) -> NDArray[np.intp]:
-        """How many instances of each model the design has, (models,)."""
-        return np.array([len(placements_of(model)) for model in self._ground.models])
+        """How many instances of each model are wanted, (models,)."""
+        places, others = self._asked.places, self._asked.others
+        return np.array([len(places[model.name]) + others.get(model.name, 0) for model in self._ground.models])
 
     def hypotheses(self) -> Iterator[Hypotheses]:
         """The poses the design gives, so many of each model at a time as one refinement takes."""
         ground, kept = self._ground, self._ground.parameters.search.kept
-        for start in range(0, int(self.wanted().max()), kept):
-            places = [placements_of(model)[start : start + kept] for model in ground.models]
+        every = [self._asked.places[model.name] for model in ground.models]
+        for start in range(0, max(map(len, every)), kept):
+            places = [some[start : start + kept] for some in every]
             self._places = [each for some in places for each in some]
             yield joined(
                 [
@@ -198,6 +216,11 @@ class InPlace:
         if not self._ground.blind and on + beside + through < enough:
             return "scanners looked at too little of it to be sure"
         return why_refused(candidate.evidence, self._ground.blind, self._ground.parameters.verify, in_place=True)
+
+
+def asked_of(models: Sequence[Model]) -> Asked:
+    """All elements of a design."""
+    return Asked({model.name: placements_of(model) for model in models}, {}, design_of(models))
 
 
 def design_of(models: Sequence[Model]) -> Design | None:

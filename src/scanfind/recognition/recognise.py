@@ -18,7 +18,7 @@ from scanfind.recognition.candidate import Candidate, Standing, closest
 from scanfind.recognition.claims import Claims, stands_elsewhere
 from scanfind.recognition.fitting import Fitting
 from scanfind.recognition.ground import Ground
-from scanfind.recognition.in_place import InPlace
+from scanfind.recognition.in_place import NOTHING, InPlace
 from scanfind.recognition.telling import Telling
 from scanfind.recognition.weighing import Weighing
 from scanfind.search.hypotheses import Hypotheses, joined, model_arrays
@@ -26,13 +26,13 @@ from scanfind.search.lines import LineSearch
 from scanfind.search.surface import Search
 
 if TYPE_CHECKING:
-    from scanfind.evidence.free_space import Design
     from scanfind.fit.refine import Refined
     from scanfind.grid.scene import Scene
     from scanfind.library import JointTable
     from scanfind.library.model import Model
     from scanfind.parameters import Parameters
     from scanfind.pose import Pose
+    from scanfind.recognition.in_place import Asked
 
 Floats = NDArray[np.float64]
 
@@ -49,28 +49,31 @@ class Recognition:
 
     Poses are drawn (`search`), fitted (`fitting`) and weighed (`weighing`) here; what is told of them is told by
     `telling`.
+
+    believed : what holds so far; by_design : of that, what was found by trying where the design puts it
     """
 
     def __init__(
         self, scene: Scene, models: Sequence[Model], table: JointTable, parameters: Parameters, seed: int, jobs: int,
-        standing: Sequence[Standing] = (), design: Design | None = None, learnt: Sequence[float] = (),
+        standing: Sequence[Standing] = (), asked: Asked | None = None, learnt: Sequence[float] = (),
     ) -> None:  # fmt: skip
-        """Take a scene; standing : instances of larger models; design, learnt : see `find.recognise`."""
+        """Take a scene; standing : instances of larger models; asked, learnt : see `find.recognise`."""
         self.ground = ground = Ground(scene, models, model_arrays(models), parameters, jobs)
         self.search = Search(
             scene, models, table, ground.arrays, parameters.search, seed, jobs, learnt, parameters.priors
         )
-        self.weighing = Weighing(ground, self.search.telling(), design)
+        self.weighing = Weighing(ground, self.search.telling(), asked.shadows if asked else None)
         self.fitting = Fitting(ground, self.weighing)
         view = View(scene, self.weighing.fine, self.weighing.thin, ground.signed, parameters.verify)
         assemblies = Assemblies(models, view, parameters.assembly, ground.blind)
-        self.telling = Telling(ground, self.weighing, assemblies)
+        self.telling = Telling(ground, assemblies)
         self._by_parts = ByParts(ground, assemblies, self.fitting.apart)
-        self._in_place = InPlace(ground, self.fitting, self.weighing)
+        self._asked, self._in_place = asked, InPlace(ground, self.fitting, self.weighing, asked or NOTHING)
         # What surface found elsewhere need not be looked for by lines here.
         self._by_lines = np.array([not share for share in learnt or [0.0] * len(models)])
         self._seed, self._standing = seed, standing
         self.believed: list[Candidate] = []
+        self.by_design: list[Candidate] = []
         self._refused: list[tuple[Candidate, str]] = []
         self._ran_out_of_time = False
         expected = parameters.priors.expected([model.name for model in models])
@@ -134,12 +137,14 @@ class Recognition:
         return self.search.round()
 
     def at_design(self) -> Iterator[Hypotheses]:
-        """The poses the design gives, some of each model at a time.
+        """The poses the design gives, some of each model at a time; none where none is asked for.
 
         From here on as many instances of each model are wanted as the design has.
         """
-        self._wanted = self._in_place.wanted()
-        yield from self._in_place.hypotheses()
+        if self._asked:
+            self._wanted = self._in_place.wanted()
+            self.search.served(self._wanted <= 0)
+            yield from self._in_place.hypotheses()
 
     def progress(self) -> float:
         """How far the search has come, 0 … 1: the log of the chance to have missed something, as against its limit."""
@@ -160,6 +165,7 @@ class Recognition:
         """Of poses the design gives, as `refine_in_place` leaves them, believe what holds there."""
         fresh, refused = self._in_place.believe(refined, self.believed)
         self.believed += fresh
+        self.by_design += fresh
         self._refused += refused
         self._settled(Claims(self.ground, self.believed))
 

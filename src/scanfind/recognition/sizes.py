@@ -122,25 +122,25 @@ class Sizes:
     def with_stations(self, found: Detection, stations: Floats) -> Detection:
         """A detection with what each station says of it; stations : where all of them stood, in order, (S, 3)."""
         search = self._of(found.model)
-        number = next(number for number, model in enumerate(search.models) if model.name == found.model)
-        return search.telling.with_stations(number, found, stations)
+        model = next(model for model in search.models if model.name == found.model)
+        return search.weighing.witnesses.with_stations(model, found, stations)
 
     def with_ends(self, detections: Sequence[Detection]) -> list[Detection]:
         """Detections, those that stand for an element slid to where beams say that their ends are."""
         told = {
             key: one
             for search in self.all
-            for number in range(len(search.models))
-            for key, one in search.telling.with_ends(number, detections).items()
+            for model in search.models
+            for key, one in search.weighing.witnesses.with_ends(model, detections).items()
         }
         return [told.get(one.id, one) for one in detections]
 
     def elements(self, detections: Sequence[Detection], stations: Floats) -> list[Element]:
         """What became of each element of the design, in the order of the models; stations : see `with_stations`."""
         told = {
-            model.name: search.telling.elements(number, detections, stations)
+            model.name: search.weighing.witnesses.elements(model, detections, stations)
             for search in self.all
-            for number, model in enumerate(search.models)
+            for model in search.models
         }
         return [element for model in self._models for element in told[model.name]]
 

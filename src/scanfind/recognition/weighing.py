@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.evidence.free_space import Limits, Spoken, caster_of, spoken_by_each
+from scanfind.evidence.free_space import Limits, Spoken
 from scanfind.evidence.verify import Evidence, Level, gather_rough, gather_support, rough_score, score
 from scanfind.pose import Pose
 from scanfind.recognition.candidate import Candidate
+from scanfind.recognition.witnesses import Witnesses
 
 if TYPE_CHECKING:
     from scanfind.evidence.free_space import Design
-    from scanfind.evidence.rays import RayCaster
     from scanfind.evidence.verify import Rough, VerifyParameters
     from scanfind.fit.refine import Refined
     from scanfind.recognition.ground import Ground
@@ -33,19 +33,18 @@ NET_PENALTY = 2.0
 # Before ICP a hypothesis may lie so many coarse cells off the scene; a beam through it counts so much against it.
 DRAWN_CELLS, ROUGH_PENALTY = 0.5, 3.0
 TOLD_BY_LINES = 12  # poses that these speak for, refined whatever the coarse surfels say
-EDGE_INLIERS = 2.0  # a laser's spot is a centimetre wide at 10 m: nearer to the outline some of it went past
 
 
 class Weighing:
     """What the scene says of poses.
 
-    tells : how much surfels of the fine and of the coarse cells tell (Search.telling)
-    design : all elements where the design has them; None where nobody asks for them in their places
+    witnesses : its scanners
     lines : what lines say, once these were asked
     """
 
     def __init__(self, ground: Ground, tells: tuple[Floats, Floats], design: Design | None) -> None:
-        self._ground, self.design = ground, design
+        """Take a scene; tells : how much its fine and coarse surfels tell (Search.telling); design : see Witnesses."""
+        self._ground = ground
         self.lines: LineSearch | None = None
         scene, parameters = ground.scene, ground.parameters
         inlier = parameters.verify.inlier_noises * scene.noise
@@ -54,7 +53,8 @@ class Weighing:
         self.thin = Level(scene.coarse, tells[1], ALL_SAMPLES, inliers[0])
         self._rough = Level(scene.coarse, tells[1], parameters.refine.coarse_samples, inliers[1])
         self._drawn = self._rough._replace(inlier=DRAWN_CELLS * scene.coarse.cell)
-        self._casters: dict[int, RayCaster] = {}
+        limits = Limits(self.fine.inlier, self.fine.margin(parameters.verify), parameters.verify.least_facing)
+        self.witnesses = Witnesses(scene.beams, ground.offset, limits, design)
 
     def candidates(self, refined: Refined, *, in_place: bool = False) -> list[Candidate]:
         """Refined poses with their evidence; in_place : of where the design puts the models."""
@@ -89,27 +89,8 @@ class Weighing:
 
     def spoken_of(self, number: int, placed: Pose, *, in_place: bool = False) -> Spoken:
         """What beams say of a model at a pose relative to the grid's offset; in_place : see `candidates`."""
-        return Spoken(*self.said_by_each(number, placed, in_place=in_place).sum(axis=0).tolist())
-
-    def said_by_each(self, number: int, placed: Pose, *, in_place: bool = False) -> Floats:
-        """What the beams of each of S scanners say, rows as of Spoken, (S, 4)."""
-        ground, limits = self._ground, self.limits(in_place=in_place)
-        return spoken_by_each(
-            ground.models[number], self.caster(number), placed, ground.scene.beams, limits,
-            self.design if in_place else None, ground.offset,
-        )  # fmt: skip
-
-    def limits(self, *, in_place: bool = False) -> Limits:
-        """When a beam is on a surface, beside it, or through; in_place : see `candidates`."""
-        verify, level = self._ground.parameters.verify, self.fine
-        edge = EDGE_INLIERS * level.inlier if in_place else 0.0
-        return Limits(level.inlier, level.margin(verify), verify.least_facing, edge)
-
-    def caster(self, number: int) -> RayCaster:
-        """The surface of a model, made ready for beams when first asked for."""
-        if number not in self._casters:
-            self._casters[number] = caster_of(self._ground.models[number])
-        return self._casters[number]
+        by_each = self.witnesses.say_by_each(self._ground.models[number], placed, in_place=in_place)
+        return Spoken(*by_each.sum(axis=0).tolist())
 
     def best_drawn(self, hypotheses: Hypotheses) -> Hypotheses:
         """The same, best first, by what coarse surfels and beams say of them as they were drawn.

@@ -192,7 +192,8 @@ class Search:
 
     def _fill_pool(self) -> None:
         """Choose the surfels that may be drawn: each cell's with a chance by the likelihood ratio of its shape."""
-        counts, kept = self._likelihood(self._free)
+        counts = self._counts(self._classes[self._free])
+        kept = self._likelihood(counts)
         kept = kept * min(1.0, MOST_POOL / max(float(kept @ counts), 1.0))
         # Where the telling cells are few, the others fill up: they may be all there is to draw from.
         while 0 < np.minimum(kept, 1.0) @ counts < min(LEAST_POOL, 0.9 * counts.sum()):
@@ -227,21 +228,21 @@ class Search:
 
         A plate flush with a floor lies on the scene with all of its samples, and that means nothing.
         """
-        _, likelihood = self._likelihood(np.ones(len(self._classes), np.bool_))
-        scene, tells = self.scene, np.sqrt(likelihood)
+        # What is absent tells as much as what is rare: a bare floor, or a tile of one, tells nothing.
+        scene, tells = self.scene, np.sqrt(self._likelihood(np.maximum(self._counts(self._classes), 1)))
         coarse = shape_classes(flatness_above(scene.coarse, 1, scene.around), 3.0 * scene.around.cell)
         return tells[self._classes], tells[coarse]
 
-    def _likelihood(self, among: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Floats]:
-        """Of C classes of shape, how many of some cells are in each, and its likelihood ratio over the largest, (C,).
+    def _counts(self, classes: NDArray[np.int8]) -> NDArray[np.intp]:
+        """Of C classes of shape, how many of some cells are in each, (C,); classes : of these cells."""
+        return np.bincount(classes, minlength=len(BEND_BORDERS) + 1)
 
-        among : (V,) which cells
-        """
-        counts = np.bincount(self._classes[among], minlength=len(BEND_BORDERS) + 1)
+    def _likelihood(self, counts: NDArray[np.intp]) -> Floats:
+        """Of C classes of shape that so many cells are in, the likelihood ratio of each over the largest, (C,)."""
         if not self.parameters.by_shape:
-            return counts, np.ones(len(counts))
+            return np.ones(len(counts))
         ratio = np.where(counts > 0, self.model_shapes.mean(axis=0) / np.maximum(counts, 1), 0.0)
-        return counts, ratio / max(ratio.max(), 1e-300)
+        return np.asarray(ratio / max(ratio.max(), 1e-300))
 
     def may_stop(self) -> bool:
         """Is nothing left to draw from, or the chance to have missed an instance of any model below the one allowed?"""

@@ -6,6 +6,7 @@
               other tiles tell that it was not enough                       one task a tile
     own       each instance once: by the tile that has its middle
     isolate   each scan, once more: the points of every instance            one task a scan
+    tell      what beams say of each instance and each element of a design  one task a tile
 
 Peak memory depends on the surface in a tile and on the library, never on the number of points. What a task gives
 depends on nothing but the scans and the parameters, so results are the same on any workers
@@ -20,6 +21,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING
@@ -30,6 +32,7 @@ from pydantic_core import to_jsonable_python
 
 from scanfind.clock import Clock, say_if_compiling
 from scanfind.cloud import shift_for
+from scanfind.design.elements import placements_of
 from scanfind.detection import Findings
 from scanfind.errors import Interrupted, UnreadableFileError, UnsupportedFormatError, UsageError
 from scanfind.grid.moments import MomentGrid
@@ -50,18 +53,11 @@ from scanfind.tiles.plan import (
     words,
 )
 from scanfind.tiles.points import isolate_all, write_remainder
+from scanfind.tiles.search import Searched, cell_of, own
 from scanfind.tiles.stored import parts_of, reached_from, stored_bins
 from scanfind.tiles.sweep import search_all
-from scanfind.tiles.tasks import (
-    Found,
-    Job,
-    Searched,
-    Summed,
-    cell_of,
-    count,
-    own,
-    sum_up,
-)
+from scanfind.tiles.tasks import Found, Job, Summed, count, sum_up
+from scanfind.tiles.told import all_told
 from scanfind.tiles.work import Crew, Here, Workers, all_done, no_room, opened
 
 if TYPE_CHECKING:
@@ -93,17 +89,19 @@ def find_in_tiles(
     units: str | None = None,
     select: Sequence[str] = (),
     progress: Progress | None = None,
+    isolate: bool = True,
     remainder: CloudWriter | None = None,
+    at_design: bool = False,
     say: Callable[[str], None] | None = None,
 ) -> Findings:
-    """As `find`, for sites of any size: the same detections, to what a pose is sure by.
+    """As `find`, for sites of any size: the same detections and elements, to what a pose is sure by.
 
         executor : any of concurrent.futures, or what makes one: then a pool whose worker was killed is made anew.
             Workers see the same files under the same names. None: this process
         memory : bytes a worker may take; the site is cut into tiles that fit. The result depends on it, as tiles have
             edges, but not on the executor
         work : a folder for what is done, kept when the run ends early, and by its caller afterwards: points of
-            detections are mapped from it. None: a temporary one
+            detections are mapped from it. With `at_design` in a folder of its own there. None: a temporary one
         resume : go on with what `work` holds
         jobs : threads of a worker
         remainder : takes every point that belongs to no detection; this process reads all scans once more for it
@@ -128,11 +126,13 @@ def find_in_tiles(
         folder = Path(work).absolute() if work is not None else Path(mkdtemp(prefix="scanfind-"))
         if work is None:
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        if at_design:  # an inspection may find where the design lies, and put it there: that is another run
+            folder /= digest_of_places(library)
         try:
             crew = stack.enter_context(Crew(executor or Here()))
             return _find(
                 folder, listed, library, crew, memory, parameters, seed, jobs or available_cores(), clock, tell, say,
-                remainder, resume=resume or work is None,
+                remainder, resume=resume or work is None, isolate=isolate, at_design=at_design,
             )  # fmt: skip
         except KeyboardInterrupt as error:
             if work is None:
@@ -144,13 +144,13 @@ def find_in_tiles(
 def _find(
     folder: Path, listed: Listed, library: list[Model], crew: Crew, memory: int, parameters: Parameters,
     seed: int, jobs: int, clock: Clock, tell: Progress, say: Callable[[str], None], remainder: CloudWriter | None, *,
-    resume: bool,
+    resume: bool, isolate: bool, at_design: bool,
 ) -> Findings:  # fmt: skip
     sizes = Sizes(library, parameters)
     cell = sizes.finest_cell()
     blocks = bin_blocks(cell, min(model.diameter for model in library))
     box = box_searched(library, parameters.priors, parameters.search.max_instances)
-    job = Job(folder, cell, (0.0, 0.0, 0.0), blocks, memory, jobs, parameters, seed, listed.origin, box)
+    job = Job(folder, cell, (0.0, 0.0, 0.0), blocks, memory, jobs, parameters, seed, listed.origin, box, at_design)
     keep_memory(job, sizes, listed, say)
 
     begin(job, listed, library, resume=resume)
@@ -164,10 +164,12 @@ def _find(
         require_points_in(box, int(held.rows.sum()), job.offset)
 
     findings, searched, largest = Findings(), list[Searched](), None
+    swept: list[dict[Tile, Searched]] = []  # of each size
     for group, size in enumerate(sizes.groups()):
         with clock("search"):
             found = search_all(job, group, size.models, held, summed, folders, findings, searched, crew, tell)
             findings.extend(own(found, job))
+            swept.append(found)
             searched += found.values()
             largest = largest or next((one for one in typical(found) if one.detections), None)
     findings[:] = numbered(findings, parameters.search.max_instances)
@@ -177,13 +179,16 @@ def _find(
         one = largest or searched[-1]
         tolerance = isolation_tolerance(parameters.isolate, one.noise, one.cell)
         placed = [Found(one.id, one.model, one.scene_from_model) for one in findings]
-        if findings:
+        if isolate and findings:
             findings.tolerance_m = tolerance
             findings[:] = isolate_all(job, listed, findings, placed, tolerance, summed, crew, clock, tell)
         if remainder is not None:
             write_remainder(job, listed, placed, tolerance, summed, remainder, tell)
-    findings.expected = parameters.priors.expected([model.name for model in library])
     findings.scans, findings.crs = [one.told for one in summed], listed.crs()
+    with clock("verify"):
+        if at_design or len(findings.stations()) > 1:
+            findings[:], findings.elements = all_told(job, findings, swept, findings.stations(), folders, crew)
+    findings.expected = parameters.priors.expected([model.name for model in library])
     findings.missing = [f"{one.told.path} was left out: {one.missing}" for one in summed if one.missing]
     left_out = sum(one.unaddressable for one in summed)
     findings.notes = [
@@ -227,6 +232,15 @@ def begin(job: Job, listed: Listed, library: list[Model], *, resume: bool) -> No
             (job.folder / "models.part").replace(job.folder / "models")
     except OSError as error:
         raise no_room(job.folder, error) from error
+
+
+def digest_of_places(library: Sequence[Model]) -> str:
+    """Of where the design puts every model."""
+    digest = sha256()
+    for model in library:
+        for place in placements_of(model):
+            digest.update(f"{model.name} {place.global_id}".encode() + place.design_from_model.matrix().tobytes())
+    return digest.hexdigest()[:16]
 
 
 def offset_of(listed: Listed, cell: float) -> tuple[float, float, float]:

@@ -115,6 +115,11 @@ class Held(NamedTuple):
         inside = tile.holds(self.bins)
         return Held(self.bins[inside], self.rows[inside], self.reached)
 
+    def with_bins(self, bins: Ints) -> Held:
+        """With some bins (K, 3) more, that nothing need lie in."""
+        every, first = np.unique(np.concatenate([self.bins, bins]), axis=0, return_index=True)
+        return Held(every, np.concatenate([self.rows, np.zeros(len(bins), np.int64)])[first], self.reached)
+
     def needed(self, tile: Tile) -> int:
         """Bytes it takes to search a tile that has its margin."""
         inside = (self.reached[:, 0] <= tile.high).all(axis=1) & (self.reached[:, 1] >= tile.low).all(axis=1)

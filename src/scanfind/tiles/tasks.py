@@ -1,11 +1,11 @@
-"""What a worker does: sum a scan up, search a tile, cut a scan's points. Each task depends on its arguments alone."""
+"""What a worker does with a scan: sum it up, cut its points. Each task depends on its arguments alone."""
 
 from __future__ import annotations
 
 import pickle
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from math import ceil
 from pathlib import Path
@@ -14,28 +14,24 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.clock import Clock
-from scanfind.detection import Detection, IsolatedPoints, Refused, SceneScan
+from scanfind.detection import IsolatedPoints, SceneScan
 from scanfind.dimensions import plan_of
 from scanfind.errors import InvalidGeometryError, UnreadableFileError, UnsupportedFormatError
-from scanfind.find import recognise
 from scanfind.grid.moments import MomentGrid
-from scanfind.grid.scene import first_cell
 from scanfind.isolation.isolate import IsolateParameters, Isolator, Placed, joined, pieces_of
 from scanfind.library.near_surface import near_model
 from scanfind.parameters import Parameters
 from scanfind.pose import Pose
-from scanfind.recognition.candidate import Standing
-from scanfind.recognition.sizes import Size, Sizes, by_size
+from scanfind.recognition.in_place import AROUND_MOST_M, design_of
 from scanfind.scans.sources import Scan, source_of
-from scanfind.tiles.plan import BASE_BYTES, RIM, Tile, bin_metres, margin_of
-from scanfind.tiles.stored import Store, beams_into, count_in, parts_of, rows_in, summed_rows
+from scanfind.tiles.plan import BASE_BYTES, bin_metres, margin_of
+from scanfind.tiles.stored import Store, summed_rows
 
 if TYPE_CHECKING:
     from scanfind.dimensions import Plan
+    from scanfind.evidence.free_space import Design
     from scanfind.kernels.distance import NearSurface
     from scanfind.library.model import Model
-    from scanfind.search.surface import Tally
 
 # A grid is written out when it takes a third of the memory: its arrays double, and a chunk of points lies beside it.
 GRID_SHARE = 1.0 / 3.0
@@ -51,6 +47,7 @@ class Job:
     cell, offset : of every grid; blocks : log2 of the blocks along a bin's edge
     memory : bytes a worker may take; jobs : its threads
     box : (2, 3) in which points are kept, scans' frame, metres; None: everywhere
+    at_design : models are tried where the design has them, see `find`
     """
 
     folder: Path
@@ -63,6 +60,7 @@ class Job:
     seed: int
     origin: tuple[float, float, float] | None = None
     box: NDArray[np.float64] | None = None
+    at_design: bool = False
 
     def grid(self) -> MomentGrid:
         """An empty one."""
@@ -78,7 +76,9 @@ class Job:
 
     def margin(self, models: Sequence[Model]) -> int:
         """How many bins around a tile the search for some models needs."""
-        return ceil(margin_of(models) / self.bin_m())
+        # What is beside its place in the design is its owner's all the same.
+        beside = AROUND_MOST_M if self.at_design else 0.0
+        return ceil((margin_of(models) + beside) / self.bin_m())
 
 
 class Summed(NamedTuple):
@@ -89,22 +89,6 @@ class Summed(NamedTuple):
     signed: bool
     unaddressable: int
     missing: str = ""
-
-
-class Searched(NamedTuple):
-    """What was found in one tile, its own or nearly so; see `own`.
-
-    noise, cell, reach : of the search, metres
-    tally : how it went, for each model
-    """
-
-    detections: list[Detection]
-    refused: list[Refused]
-    notes: list[str]
-    noise: float
-    cell: float
-    reach: float
-    tally: Tally
 
 
 class Cut(NamedTuple):
@@ -129,6 +113,12 @@ def models_in(folder: Path) -> list[Model]:
     with (folder / "models").open("rb") as file:
         models: list[Model] = pickle.load(file)
     return models
+
+
+@lru_cache(maxsize=2)
+def design_in(folder: Path) -> Design | None:
+    """All elements of a design in their places, made ready for beams once a worker."""
+    return design_of(models_in(folder))
 
 
 @lru_cache(maxsize=256)
@@ -174,96 +164,6 @@ def sum_up(folder: Path, job: Job, scan: Scan, number: int) -> Summed:
 def count(folder: Path, parts: Sequence[Path], bins: NDArray[np.int64]) -> NDArray[np.int64]:
     """How many rows some bins (K, 3) have when all parts are summed, (K,)."""
     return summed_rows(parts, bins)
-
-
-def search(
-    folder: Path, job: Job, group: int, tile: Tile, standing: Sequence[Found], reach: float, signed: bool,
-    scans: Sequence[Path], learnt: Sequence[float], deeper: bool,
-) -> Searched:  # fmt: skip
-    """Search a tile, with its margin, for the models of one size.
-
-    standing : instances of larger models; reach : how far from their surface their points may lie, metres
-    scans : the folders of those summed up
-    learnt : see Search; deeper : see SearchParameters
-    """
-    models = by_size(job.models())[group]
-    # How many there are of the whole site says nothing of a tile.
-    limits, priors = job.parameters.search, replace(job.parameters.priors, expect=None)
-    own = replace(job.parameters, search=replace(limits, max_instances=None, deeper=deeper), priors=priors)
-    grid = grid_of(job, models, tile, signed, scans)
-    taken = [Standing(surface_of(job.folder, one.model, reach), one.scene_from_model) for one in standing]
-    found = Sizes(models, own)
-    search = recognise(
-        Size(models, 0, 1), grid, taken, own, job.seed, job.jobs, Clock(), _silent, at_design=False, learnt=learnt
-    )
-    found.add(search)
-    middles = {model.name: model.samples.points.mean(axis=0) for model in models}
-    diameters = {model.name: model.diameter for model in models}
-
-    def near(one: Detection | Refused) -> bool:
-        middle = one.scene_from_model.move(middles[one.model][None])[0] - job.offset
-        return tile.has(middle, job.bin_m(), RIM * diameters[one.model])
-
-    return Searched(
-        [one for one in found.detections() if near(one)], [one for one in found.refused() if near(one)], found.notes(),
-        found.noise(), found.cell(), search.reach(), search.search.tally(),
-    )  # fmt: skip
-
-
-def grid_of(job: Job, models: Sequence[Model], tile: Tile, signed: bool, scans: Sequence[Path]) -> MomentGrid:
-    """The moments of a tile with its margin, in the cells its models are searched with, and the beams into it."""
-    box = tile.grown(job.margin(models))
-    parts = parts_of(scans)
-    cell, levels = cell_of(job, models)
-    # Shards are not quite of one size.
-    grid = MomentGrid(cell, np.array(job.offset), job.jobs, int(1.25 * count_in(parts, box)) + 100_000)
-    grid.units *= 2.0**levels
-    for rows in rows_in(parts, box):
-        for coarse in coarsened(job, rows, levels):
-            grid.add_rows(coarse)
-    grid.look(beams_into(parts, box.metres(job.bin_m())))
-    grid.signed = signed
-    return grid
-
-
-def coarsened(job: Job, rows: NDArray[Any], levels: int) -> Sequence[NDArray[Any]]:
-    """Rows (R,) of ROW in cells of 2**levels times the edge."""
-    if not levels:
-        return [rows]
-    grid = job.grid()
-    grid.add_rows(rows)
-    for _ in range(levels):
-        grid = grid.coarser()
-    return list(grid.rows())
-
-
-def cell_of(job: Job, models: Sequence[Model]) -> tuple[float, int]:
-    """The cell that models are searched with first, metres, and how many levels it is above the finest."""
-    wanted = first_cell([model.diameter for model in models], job.parameters.grid)
-    cell, levels = job.cell, 0
-    while 2.0 * cell <= wanted * (1.0 + 1e-9):
-        cell, levels = 2.0 * cell, levels + 1
-    return cell, levels
-
-
-def own(searched: Mapping[Tile, Searched], job: Job) -> list[Detection]:
-    """The detections of all tiles, each instance once, in the order of the tiles.
-
-    Of two tiles that tell the same instance the one in whose half-open box its middle lies is believed.
-    """
-    every = [(tile, one) for tile, found in sorted(searched.items()) for one in found.detections]
-    mine = {id(one): tile.has(np.array(one.pivot) - job.offset, job.bin_m()) for tile, one in every}
-    diameters = {model.name: model.diameter for model in job.models()}
-    kept: list[tuple[Tile, Detection]] = []
-    for tile, one in sorted(every, key=lambda pair: not mine[id(pair[1])]):
-        middle, rim = np.array(one.pivot), RIM * diameters[one.model]
-        if not any(
-            other.model == one.model and there != tile and np.linalg.norm(np.array(other.pivot) - middle) < rim
-            for there, other in kept
-        ):
-            kept.append((tile, one))
-    order = {id(one): place for place, (_, one) in enumerate(every)}
-    return sorted((one for _, one in kept), key=lambda one: order[id(one)])
 
 
 def isolator_of(job: Job, found: Sequence[Found], tolerance: float) -> Isolator:
@@ -347,7 +247,3 @@ def on_disk(points: IsolatedPoints, folder: Path) -> IsolatedPoints:
         mapped("xyz", points.xyz), attributes, mapped("scan_id", points.scan_id),
         mapped("source_index", points.source_index), mapped("deviation", points.deviation),
     )  # fmt: skip
-
-
-def _silent(stage: str, done: float, total: float) -> None:
-    pass

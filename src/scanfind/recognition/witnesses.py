@@ -1,0 +1,118 @@
+"""Scanners as witnesses: what their beams say of models at poses. No surfels are asked, so any process can."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanfind.design.elements import Element, assigned, elements_of, open_slide, placements_of, said_by
+from scanfind.detection import Detection, Motion
+from scanfind.evidence.ends import slid
+from scanfind.evidence.free_space import Limits, caster_of, spoken_by_each
+from scanfind.fit.refine import triple
+from scanfind.pose import Pose
+
+if TYPE_CHECKING:
+    from scanfind.evidence.free_space import Design
+    from scanfind.evidence.rays import RayCaster
+    from scanfind.grid.depth import Beams
+    from scanfind.library.model import Model
+
+Floats = NDArray[np.float64]
+
+EDGE_INLIERS = 2.0  # a laser's spot is a centimetre wide at 10 m: nearer to the outline some of it went past
+ALONG = 0.95  # cosine between a slide and one that is the same
+
+
+@dataclass(frozen=True, eq=False)
+class Witnesses:
+    """The scanners of a scene.
+
+    beams : what each of S of them saw, relative to the grid's offset
+    offset : (3,) of the grid, metres in the scans' own frame
+    limits : when a beam is on a surface, beside it, or through
+    design : all elements where the design has them; None where nobody asks for them in their places
+    """
+
+    beams: Sequence[Beams]
+    offset: Floats
+    limits: Limits
+    design: Design | None
+    _casters: dict[str, RayCaster] = field(default_factory=dict, init=False)
+
+    def say_by_each(self, model: Model, placed: Pose, *, in_place: bool = False) -> Floats:
+        """What each says of a model at a pose relative to the grid's offset, rows as of Spoken, (S, 4), m².
+
+        in_place : of where the design puts it
+        """
+        limits = self.limits._replace(edge=EDGE_INLIERS * self.limits.inlier) if in_place else self.limits
+        design = self.design if in_place else None
+        return spoken_by_each(model, self._caster(model), placed, self.beams, limits, design, self.offset)
+
+    def say_at(self, model: Model, pose: Pose) -> Floats:
+        """What each says of a model at a pose in the scans' own frame: as `say_by_each`, in place where asked so."""
+        return self.say_by_each(model, self._in_grid(pose), in_place=self.design is not None)
+
+    def elements(self, model: Model, detections: Sequence[Detection], stations: Floats) -> list[Element]:
+        """What became of each element of the design that is of a model.
+
+        detections : as they are reported; stations : where all of them stood, in order, (S, 3)
+        """
+        said = [self.say_at(model, each.design_from_model) for each in placements_of(model)]
+        return elements_of(model, detections, said, self.numbers(stations))
+
+    def with_ends(self, model: Model, detections: Sequence[Detection]) -> dict[int, Detection]:
+        """By id the detections of a model that stand for an element, each `at_its_ends`."""
+        places = placements_of(model)
+        taken = assigned(model, places, [one for one in detections if one.model == model.name])
+        return {one.id: self.at_its_ends(model, one, places[place].design_from_model) for place, one in taken.items()}
+
+    def at_its_ends(self, model: Model, found: Detection, design: Pose) -> Detection:
+        """A detection slid to where beams say its ends are, where its faces do not tell and they refute the design's.
+
+        design : scene_from_model as the design has it, in the scans' own frame
+        """
+        placed, along = found.scene_from_model, open_slide(model, found)
+        if along is None or not self.beams or found.parts or found.covariance is None or found.pivot is None:
+            return found
+        centre = model.symmetry.centre[None]
+        alike = model.symmetry.nearest(design, placed.rotation)
+        from_here = float((alike.move(centre) - placed.move(centre))[0] @ along)
+        told = slid(
+            model, self._caster(model), self._in_grid(placed), along, from_here, self.beams, self.limits, self.design,
+            self.offset,
+        )  # fmt: skip
+        if told is None:
+            return found
+        step, covariance = told.by * along, found.covariance.copy()
+        covariance[3:, 3:] += told.sigma**2 * np.outer(along, along)
+        own = placed.rotation.T @ along
+        others = [each for each in found.unobservable if each.kind != "slide" or abs(np.dot(each.axis, own)) < ALONG]
+        return replace(
+            found, scene_from_model=Pose(placed.rotation, placed.translation + step), covariance=covariance,
+            pivot=triple(np.array(found.pivot) + step), slide=triple(along),
+            unobservable=(*others, Motion("slide", triple(own), triple(centre[0]), told.sigma)),
+        )  # fmt: skip
+
+    def with_stations(self, model: Model, found: Detection, stations: Floats) -> Detection:
+        """A detection of a model with what each station says of it; stations : see `elements`."""
+        said = self.say_at(model, found.scene_from_model)
+        return replace(found, stations=said_by(said, self.numbers(stations)))
+
+    def numbers(self, stations: Floats) -> list[int]:
+        """Of each scanner the number, from 1, of the station that stood where it did; stations : see `elements`."""
+        stood = [scanner.origin + self.offset for scanner in self.beams]
+        return [1 + int(np.nanargmin(np.linalg.norm(stations - where, axis=1))) for where in stood]
+
+    def _in_grid(self, pose: Pose) -> Pose:
+        return Pose(pose.rotation, pose.translation - self.offset)
+
+    def _caster(self, model: Model) -> RayCaster:
+        """The surface of a model, made ready for beams when first asked for."""
+        if model.name not in self._casters:
+            self._casters[model.name] = caster_of(model)
+        return self._casters[model.name]
