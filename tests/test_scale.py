@@ -32,7 +32,7 @@ from scanfind.priors import Priors
 from scanfind.results import read_results, write_results
 from scanfind.results.document import findings_of
 from scanfind.scale.steps import STEP, sized, sizes_tried
-from scanfind.scans import open_writer, read_scan
+from scanfind.scans import open_writer
 from scanfind.simulate.furniture import hall
 from scanfind.simulate.parts import blocks, box, cylinder, pipe
 from scanfind.simulate.placement import surface_points
@@ -57,6 +57,8 @@ BRACKET = blocks(
         ((0, 0.15, 0.75), (0.15, 0.5, 0.9)),
     ],
 )
+# Metres a unit, of clouds that are as much too large as is asked for, and somewhat too small.
+SMALLER, LARGER = 1.0 / 1.1, 1.0 / 0.953
 PLACES = (
     Pose.from_rotation_vector([0.0, 0.0, 0.7], [2.9, 1.3, 0.0]),
     Pose.from_rotation_vector([0.5 * np.pi, 0.0, 0.0], [0.5, 3.4, 0.0]),
@@ -92,7 +94,7 @@ def found_at(scale: float) -> Findings:
 # ── found ──
 
 
-@pytest.mark.parametrize("scale", [1.0 / 0.9, 1.0 / 0.953, 1.0 / 1.1])
+@pytest.mark.parametrize("scale", [SMALLER, LARGER])
 def test_in_a_scan_of_another_scale_are_that_scale_and_the_same_poses(scale: float) -> None:
     found, rigid = found_at(scale), find(list(room()), library(), parameters=QUICK)
     assert found.scan_scale is not None
@@ -109,10 +111,9 @@ def test_in_a_scan_of_another_scale_are_that_scale_and_the_same_poses(scale: flo
 
 def test_all_that_is_told_is_in_metres() -> None:
     """Points are the scans' own times the scale, and so is where scanners stood."""
-    scale = 1.0 / 0.953
-    found = found_at(scale)
+    found, clouds = found_at(LARGER), room(LARGER)
     assert found.scan_scale is not None
-    metres, clouds = found.scan_scale.metres, room(scale)
+    metres = found.scan_scale.metres
     for one in found:
         assert one.isolated is not None
         for k, cloud in enumerate(clouds):
@@ -123,10 +124,10 @@ def test_all_that_is_told_is_in_metres() -> None:
 
 
 def test_with_the_scale_found_a_scan_in_metres_gives_the_same_to_the_last_bit() -> None:
-    found = found_at(1.0 / 0.953)
+    found = found_at(LARGER)
     assert found.scan_scale is not None
     metres = found.scan_scale.metres
-    clouds = [PointCloud(metres * c.xyz, {}, metres * np.asarray(c.origin)) for c in room(1.0 / 0.953)]
+    clouds = [PointCloud(metres * c.xyz, {}, metres * np.asarray(c.origin)) for c in room(LARGER)]
     rigid = find(clouds, library(), parameters=QUICK)
     assert [one.scene_from_model.matrix().tolist() for one in rigid] == [
         one.scene_from_model.matrix().tolist() for one in found
@@ -134,12 +135,20 @@ def test_with_the_scale_found_a_scan_in_metres_gives_the_same_to_the_last_bit() 
 
 
 def test_a_region_is_in_the_scans_own_unit() -> None:
-    scale = 1.0 / 0.9
-    middle = PLACES[0].move(BRACKET.vertices.mean(axis=0)[None])[0] / scale
+    middle = PLACES[0].move(BRACKET.vertices.mean(axis=0)[None])[0] / SMALLER
     low, high = (middle - 0.3).tolist(), (middle + 0.3).tolist()
     priors = Priors(region=(*low, *high), scale_free=0.1, up="z")
-    (one,) = find(list(room(scale)), library(), parameters=replace(QUICK, priors=priors), isolate=False)
+    (one,) = find(list(room(SMALLER)), library(), parameters=replace(QUICK, priors=priors), isolate=False)
     assert one.scene_from_model.difference(PLACES[0])[0] < 0.002
+
+
+def test_a_model_may_be_drawn_far_from_its_origin() -> None:
+    """As a building's parts are: what is scaled is the distance from the scan's origin, not from the model's."""
+    drawn = Mesh.of("bracket", BRACKET.vertices + np.array([400.0, -300.0, 20.0]), BRACKET.faces)
+    found = find(list(room(SMALLER)), drawn, parameters=FREE, isolate=False)
+    assert found.scan_scale is not None
+    assert found.scan_scale.metres == pytest.approx(SMALLER, rel=2e-4)
+    assert len(found) == len(PLACES)
 
 
 def test_where_nothing_tells_the_scale_nothing_is_found_and_it_is_said() -> None:
@@ -156,17 +165,10 @@ def test_where_nothing_tells_the_scale_nothing_is_found_and_it_is_said() -> None
 
 
 def test_a_result_keeps_the_scale_and_isolates_again_by_it(tmp_path: Path) -> None:
-    scale = 1.0 / 0.953
-    files = []
-    for k, cloud in enumerate(room(scale)):
-        files.append(tmp_path / f"{k}.ply")
-        with open_writer(files[-1], {}) as writer:
+    files, found = [tmp_path / "0.ply", tmp_path / "1.ply"], found_at(LARGER)
+    for file, cloud in zip(files, room(LARGER), strict=True):
+        with open_writer(file, {}) as writer:
             writer.write(cloud.xyz, {})
-    written = [np.concatenate([chunk.xyz for chunk in read_scan(file)]) for file in files]
-    origins = [cloud.origin for cloud in room(scale)]
-    found = find(
-        [PointCloud(xyz, {}, at) for xyz, at in zip(written, origins, strict=True)], library(), parameters=FREE
-    )
     write_results(found, tmp_path / "found", models=library(), parameters=FREE)
     before = read_results(tmp_path / "found")
     assert findings_of(before).scan_scale == found.scan_scale

@@ -7,7 +7,7 @@ points. From there on the scans are in metres, and everything is rigid.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from math import log, nan
 from typing import TYPE_CHECKING, NamedTuple
@@ -26,6 +26,7 @@ from scanfind.library import joint_table
 from scanfind.library.near_surface import near_model
 from scanfind.parameters import IsolationParameters
 from scanfind.pose import Pose
+from scanfind.priors.allowed import middle_of
 from scanfind.recognition.fitting import Fitting
 from scanfind.recognition.ground import Ground
 from scanfind.recognition.recognise import Recognition
@@ -37,6 +38,7 @@ from scanfind.second_pass import isolation_tolerance
 
 if TYPE_CHECKING:
     from scanfind.clock import Clock
+    from scanfind.cloud import PointChunk
     from scanfind.fit.refine import Refined
     from scanfind.library.model import Model
     from scanfind.parameters import Parameters
@@ -86,8 +88,10 @@ def scan_scale(
         for first in range(0, len(size.models), AT_ONCE):
             models = size.models[first : first + AT_ONCE]
             if seen := seen_in(grid, models, tried, parameters, seed, jobs, clock, tell):
-                with clock("refine"):
-                    return told_by(seen, sources, grid.offset, parameters.refine.unobservable_below, jobs)
+                sources.in_metres(seen[0].fit.scale)
+                chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
+                with clock("isolate"):
+                    return told_by(seen, chunks, grid.offset, parameters.refine.unobservable_below, jobs)
     return ScanScale(1.0, nan)
 
 
@@ -176,31 +180,35 @@ def of_one_scale(found: Sequence[Seen]) -> list[Seen]:
     """The one that explains most, and others elsewhere that agree with it, each instance once."""
     kept: list[Seen] = []
     for one in sorted(found, key=lambda seen: -seen.area):
-        middle = middle_of(one)
-        if all(np.linalg.norm(middle - middle_of(other)) > APART * other.model.diameter for other in kept) and (
+        place = place_of(one)
+        if all(np.linalg.norm(place - place_of(other)) > APART * other.model.diameter for other in kept) and (
             not kept or abs(log(one.fit.scale / kept[0].fit.scale)) < ALIKE
         ):
             kept.append(one)
     return kept
 
 
-def middle_of(seen: Seen) -> Floats:
-    """The middle (3,) of an instance, relative to the grid's offset, metres."""
-    return np.asarray(seen.fit.pose.move(seen.model.samples.points.mean(axis=0)[None])[0])
+def place_of(seen: Seen) -> Floats:
+    """Where the middle of an instance is, (3,), relative to the grid's offset, metres."""
+    return np.asarray(seen.fit.pose.move(middle_of(seen.model)[None])[0])
 
 
-def told_by(seen: Sequence[Seen], sources: Sources, offset: Floats | None, below: float, jobs: int) -> ScanScale:
+def told_by(
+    seen: Sequence[Seen], chunks: Iterable[PointChunk], offset: Floats | None, below: float, jobs: int
+) -> ScanScale:
     """The scale by the raw points of instances, or by surfels where these do not tell it.
 
-    offset : (3,) of the grid, the scans' own unit; below : see `similarity`
+    chunks : of the scans times the first one's scale; offset : (3,) of the grid, the scans' own unit
+    below : see `similarity`
     """
     scale, gate = seen[0].fit.scale, seen[0].gate
-    sources.in_metres(scale)
     placed = []
-    for number, (model, fit, _, _) in enumerate(seen, start=1):
-        pose = Pose(fit.pose.rotation, fit.pose.translation * scale / fit.scale + scale * np.asarray(offset))
-        placed.append(Placed(number, near_model(model, RAW_REACH * gate), pose))
-    points = isolate(sources.chunks(), placed, IsolateParameters(RAW_REACH * gate), jobs=jobs)
+    for number, one in enumerate(seen, start=1):
+        there = scale * (place_of(one) / one.fit.scale + np.asarray(offset))
+        rotation = one.fit.pose.rotation
+        pose = Pose(rotation, there - rotation @ middle_of(one.model))
+        placed.append(Placed(number, near_model(one.model, RAW_REACH * gate), pose))
+    points = isolate(chunks, placed, IsolateParameters(RAW_REACH * gate), jobs=jobs)
     fitted = [
         similarity(
             one.near, Similarity(1.0, nan, one.scene_from_model), points[one.id].xyz, points[one.id].scan_id,
