@@ -97,7 +97,7 @@ def find(
     units
         Of model files whose format does not say; metres unless given.
     origin
-        X,Y,Z where the scanner stood, metres, for scans that do not say.
+        X,Y,Z where the scanner stood, in the scan's coordinates, metres, for scans that do not say.
     out
         A new folder for poses and points; nothing is written without it.
     format

@@ -84,7 +84,10 @@ def agreed(fits: Sequence[Similarity]) -> tuple[float, float]:
     """The one scale of several instances, and its standard deviation.
 
     Instances share no other unknown, so that least squares of all of them at once has the mean of their scales, each
-    weighted by how well it is known, for its own.
+    weighted by how well it is known, for its own. Where they disagree by more than that, it is known as much worse
+    (Birge's ratio).
     """
-    weights = np.array([1.0 / fit.sigma**2 for fit in fits])
-    return float(weights @ [fit.scale for fit in fits] / weights.sum()), float(1.0 / sqrt(weights.sum()))
+    scales, weights = np.array([fit.scale for fit in fits]), np.array([1.0 / fit.sigma**2 for fit in fits])
+    mean = float(weights @ scales / weights.sum())
+    disagreement = float(weights @ (scales - mean) ** 2) / max(len(fits) - 1, 1)
+    return mean, sqrt(max(disagreement, 1.0) / float(weights.sum()))

@@ -33,7 +33,7 @@ class Priors:
     expect : how many instances there are of each model, or by the model's name: with so many found a search ends, with
         fewer it goes on until its time is over
     scale_free : the scans' unit may be off from a metre by up to this share: 0.1 is by ten per cent; 0: it is a metre.
-        A region and an outline are then in the scans' own unit, lengths are in metres
+        A region, an outline and where a scanner stood are then in the scans' own unit, all other lengths in metres
 
     Symmetry is understood: a drum that was turned over stands upright.
     """
