@@ -261,7 +261,9 @@ def test_settings_files_know_them(tmp_path: Path) -> None:
 
     (tmp_path / "site.toml").write_text(
         '[priors]\nregion = [0, 0, 0, 8, 5, 3]\nup = "z"\noutline = [[0, 0], [8, 0], [8, 5.5]]\n'
-        "expect = { spool = 2 }\n"
+        "expect = { spool = 2 }\nscale_free = 0.05\n"
     )
     _, read = load_settings(PRESETS, {"priors.model_up": "0,1,0"}, tmp_path / "site.toml", {"SCANFIND_PRIORS_UP": "-x"})
-    assert read.priors == Priors((0, 0, 0, 8, 5, 3), ((0, 0), (8, 0), (8, 5.5)), "-x", (0, 1, 0), expect={"spool": 2})
+    assert read.priors == Priors(
+        (0, 0, 0, 8, 5, 3), ((0, 0), (8, 0), (8, 5.5)), "-x", (0, 1, 0), expect={"spool": 2}, scale_free=0.05
+    )

@@ -49,6 +49,8 @@ def isolate_again(
         msg = f"{result_dir}: its points were never isolated: give a tolerance, such as --tolerance 0.01 (metres)"
         raise UsageError(msg)
     found, sources, clock = findings_of(before), Sources(list(scans)), Clock()
+    if found.scan_scale:
+        sources.in_metres(found.scan_scale.metres)
     with (
         result_folder(result_dir if out is None else out, overwrite=overwrite or out is None) as folder,
         ModelLibrary.open(Path(result_dir) / MODELS) if found or found.elements else ModelLibrary.in_memory() as models,
@@ -75,6 +77,7 @@ def isolate_again(
         findings = Findings([measured.get(one.id, one) for one in cut])
         findings.refused, findings.notes = found.refused, found.notes
         findings.elements, findings.alignment = found.elements, found.alignment
+        findings.scan_scale = found.scan_scale
         findings.shift, findings.crs, findings.tolerance_m = found.shift, found.crs, within
         findings.scans = seen
         if profile := profile_in(before):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,11 @@ class PointChunk:
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+    def scaled(self, factor: float) -> PointChunk:
+        """The same in other units."""
+        origin = None if self.origin is None else factor * self.origin
+        return replace(self, xyz=factor * self.xyz, origin=origin)
 
 
 @dataclass(frozen=True)

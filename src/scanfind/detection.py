@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from math import isnan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -222,6 +223,19 @@ class SceneScan:
     stations: tuple[tuple[float, float, float] | None, ...]
 
 
+class ScanScale(NamedTuple):
+    """Metres a unit of the scans' coordinates, and its standard deviation; NaN where nothing told the scale."""
+
+    metres: float
+    sigma: float
+
+    def words(self) -> str:
+        """What a user should know of it."""
+        if isnan(self.sigma):
+            return "nothing tells the scale of the scans: they are taken to be in metres"
+        return f"scale of the scans: {self.metres:.6f} ± {self.sigma:.6f} m a unit; results are in metres, scaled by it"
+
+
 class Findings(list[Detection]):
     """The detections, best first, with what a report needs around them.
 
@@ -231,6 +245,7 @@ class Findings(list[Detection]):
     missing : scans that could not be read and were left out, and why
     alignment : where the design lies in the scans, where that was found; None: they are in one frame
     expected : how many instances of a model, by its name, were expected; of others nobody said
+    scan_scale : where the scale was free: all coordinates here are those of the scans times this; None: it was not
     """
 
     refused: list[Refused]
@@ -245,17 +260,19 @@ class Findings(list[Detection]):
     missing: list[str]
     alignment: Alignment | None
     expected: dict[str, int]
+    scan_scale: ScanScale | None
 
     def __init__(self, detections: list[Detection] | None = None) -> None:
         super().__init__(detections or [])
         self.refused, self.scans, self.notes, self.elements, self.missing = [], [], [], [], []
         self.shift, self.crs, self.timings_s, self.tolerance_m = (0.0, 0.0, 0.0), None, {}, None
-        self.profile, self.alignment, self.expected = None, None, {}
+        self.profile, self.alignment, self.expected, self.scan_scale = None, None, {}, None
 
-    def as_expected(self) -> list[str]:
-        """Of each model of which so many were expected, how many were found, in words."""
+    def as_known(self) -> list[str]:
+        """In words: the scale where it was free; of models of which so many were expected, how many were found."""
         found = Counter(one.model for one in self)
-        return [f"{name}: {found[name]} of {count} expected found" for name, count in self.expected.items()]
+        scale = [self.scan_scale.words()] if self.scan_scale else []
+        return scale + [f"{name}: {found[name]} of {count} expected found" for name, count in self.expected.items()]
 
     def stations(self) -> Floats:
         """Where the scanners of all scans stood, in order, (S, 3); NaN where nobody knows."""

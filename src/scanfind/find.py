@@ -17,6 +17,7 @@ from scanfind.priors.allowed import box_searched, require_points_in
 from scanfind.recognition.in_place import asked_of
 from scanfind.recognition.recognise import Recognition
 from scanfind.recognition.sizes import Sizes
+from scanfind.scale import in_metres, scan_scale
 from scanfind.scans.sources import Scan, Sources, require_points
 from scanfind.second_pass import (
     isolation_tolerance,
@@ -68,12 +69,15 @@ def find(
         remainder : takes every point that belongs to no detection
         at_design : try where the design puts each model first, and say what became of every element: see
             `Findings.elements`; the scans are in the design's frame
-    Returns the detections, best first; poses in the scans' own frame, metres.
+    Returns the detections, best first; poses in the scans' own frame, metres; where the scale was free, in the scans
+    times `Findings.scan_scale`.
 
     Raises ScanfindError: UsageError, UnreadableFileError, InvalidGeometryError, LibraryError …
     """
     parameters, jobs = parameters or PRESETS["default"], jobs or available_cores()
     require(seed >= 0, "seed", seed, "0 or more")
+    free = parameters.priors.scale_free
+    require(not (free and at_design), "scale_free", free, "0 where models are tried in their places")
     clock, tell = Clock(), progress or (lambda stage, done, total: None)
     findings = Findings()
 
@@ -83,6 +87,11 @@ def find(
         sources = Sources(scans, origin)
     with clock("library"):
         library = models_of(models, parameters, units, select)  # 3.2 model library: surface, pairs, hash table
+        box = box_searched(library, parameters.priors, parameters.search.max_instances)
+
+    if free:  # one scale for all: from here on the scans are in metres, and everything is rigid
+        findings.scan_scale = scan_scale(sources, library, parameters, box, seed, jobs, clock, tell)
+        parameters = in_metres(sources, parameters, findings.scan_scale.metres)
         box = box_searched(library, parameters.priors, parameters.search.max_instances)
 
     with clock("grid"):  # 3.1, 3.3 scene representation: the weighted octree, in one pass
@@ -133,7 +142,7 @@ def find(
         if at_design:
             findings.elements = found.elements(findings, stations)
     findings.expected = parameters.priors.expected([model.name for model in library])
-    findings.crs, findings.notes = sources.crs(), [*findings.as_expected(), *found.notes()]
+    findings.crs, findings.notes = sources.crs(), [*findings.as_known(), *found.notes()]
     findings.shift = found.shift()
     findings.timings_s = clock.timings()
     return findings

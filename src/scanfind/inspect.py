@@ -83,6 +83,9 @@ def inspect(
     parameters = parameters or PRESETS["default"]
     profile = None if allowed is None else profile_allowing(allowed)
     models, priors = models_of(design, parameters, units, select), parameters.priors
+    if priors.scale_free:
+        msg = "inspect: how far off things are needs scans in metres: find the scale with `scanfind find --scale-free`"
+        raise UsageError(msg)
     if priors.box() is not None or priors.near_design_m is not None:
         if align == "always":
             msg = "inspect: a region, or how near to the design, needs scans and design in one frame: leave out align"

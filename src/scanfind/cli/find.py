@@ -22,6 +22,7 @@ from scanfind.cli.options import (
     Paths,
     Position,
     Seconds,
+    Share,
     Units,
     note,
     say,
@@ -64,6 +65,7 @@ def find(
     near_design: Metres | None = None,
     turned: Degrees | None = None,
     expect: Counts | None = None,
+    scale_free: Share | None = None,
     fail_on: Literal["not-found"] | None = None,
     memory: str | None = None,
     workers: Count | None = None,
@@ -95,7 +97,7 @@ def find(
     units
         Of model files whose format does not say; metres unless given.
     origin
-        X,Y,Z where the scanner stood, metres, for scans that do not say.
+        X,Y,Z where the scanner stood, in the scan's coordinates, metres, for scans that do not say.
     out
         A new folder for poses and points; nothing is written without it.
     format
@@ -140,6 +142,8 @@ def find(
         By how much they may be turned from the design then.
     expect
         How many there are of each model: with so many found its search ends, with fewer it goes on until --time-limit.
+    scale_free
+        The scans' unit may be off from a metre by this share, such as 0.1: find the scale by the models as well.
     fail_on
         Exit with 3 if some model was not found, or fewer of it than expected.
     memory
@@ -175,6 +179,7 @@ def find(
         "isolate.dimensions": dimensions or None, "assembly.parts": parts or None,
         "priors.region": region, "priors.up": up, "priors.model_up": model_up, "priors.tilt_deg": tilt,
         "priors.near_design_m": near_design, "priors.turned_deg": turned, "priors.expect": expected(expect),
+        "priors.scale_free": scale_free,
     }  # fmt: skip
     run, parameters = load_settings(PRESETS, flags, config)
     files = [Path(file) for scan in scans for file in files_of(scan)]

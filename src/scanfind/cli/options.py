@@ -20,6 +20,7 @@ Box = Annotated[str, Parameter(allow_leading_hyphen=True, metavar="X,Y,Z,X,Y,Z")
 Counts = Annotated[list[str], Parameter(consume_multiple=True, negative=(), metavar="N|MODEL=N")]
 Degrees = Annotated[float, Parameter(metavar="DEG")]
 Metres = Annotated[float, Parameter(metavar="M")]
+Share = Annotated[float, Parameter(metavar="SHARE")]
 Seconds = Annotated[float, Parameter(metavar="S")]
 Count = Annotated[int, Parameter(metavar="N")]
 

@@ -48,7 +48,8 @@ class Touching(NamedTuple):
 class Patches(NamedTuple):
     """P means of the points on a patch each.
 
-    rows : (P, 6) how far the surface goes along its normal with each motion (rotation × radius, translation)
+    rows : (P, 6) how far the surface goes along its normal with each motion (rotation × radius, translation); where it
+        may grow (P, 7), the last with growth × radius
     off : (P,) of the points from the surface, metres; variance : (P,) of that by noise alone
     """
 
@@ -92,16 +93,22 @@ def touching(
     return Touching(points, normals, off, near.reach - moved, numbered(*facing.T, scan_id[met].astype(np.int64)))
 
 
-def patches_of(on: Touching, centre: Floats, radius: float, patch: float, least_noise: float) -> Patches:
-    """The patches of points: those of one group in one cube of edge `patch`, metres, of the model's frame."""
+def patches_of(
+    on: Touching, centre: Floats, radius: float, patch: float, least_noise: float, *, growing: bool = False
+) -> Patches:
+    """The patches of points: those of one group in one cube of edge `patch`, metres, of the model's frame.
+
+    growing : the surface's size is unknown as well
+    """
+    nothing = Patches(np.empty((0, 6 + growing)), np.empty(0), np.empty(0))
     if not len(on.off):
-        return Patches(np.empty((0, 6)), np.empty(0), np.empty(0))
+        return nothing
     noise = np.maximum(noise_of(on.off, on.group), least_noise)
     gate = np.minimum(on.gate, GATE_NOISES * noise)
     kept = (np.abs(on.off) < gate) & (gate > NARROWEST * noise)
     points, normals, off, group = on.points[kept], on.normals[kept], on.off[kept], on.group[kept]
     if not len(off):
-        return Patches(np.empty((0, 6)), np.empty(0), np.empty(0))
+        return nothing
     gate, noise = gate[kept], noise[kept]
     for _ in range(NOISE_STEPS):
         # Not the median alone: it takes a scan in steps (a Kinect's) for one without noise.
@@ -111,6 +118,8 @@ def patches_of(on: Touching, centre: Floats, radius: float, patch: float, least_
     member = numbered(*cube.T, group)
     counts = np.bincount(member, follows)
     rows = np.concatenate([np.cross(points - centre, normals) / radius, normals], axis=1)
+    if growing:
+        rows = np.concatenate([rows, ((points - centre) * normals).sum(axis=1, keepdims=True) / radius], axis=1)
     return Patches(
         np.stack([np.bincount(member, follows * column) / counts for column in rows.T], axis=1),
         np.bincount(member, off) / counts,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Literal
 
@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from scanfind.errors import UsageError, require
 
 Floats = NDArray[np.float64]
+# Two sizes of a part farther apart than this are as likely two parts (a pipe of 4 inches, one of 5).
+MOST_FREE = 0.15
 Direction = Literal["x", "y", "z", "-x", "-y", "-z"] | tuple[float, float, float]
 
 
@@ -30,6 +32,8 @@ class Priors:
     turned_deg : … and turned by no more than this
     expect : how many instances there are of each model, or by the model's name: with so many found a search ends, with
         fewer it goes on until its time is over
+    scale_free : the scans' unit may be off from a metre by up to this share: 0.1 is by ten per cent; 0: it is a metre.
+        A region, an outline and where a scanner stood are then in the scans' own unit, all other lengths in metres
 
     Symmetry is understood: a drum that was turned over stands upright.
     """
@@ -42,6 +46,7 @@ class Priors:
     near_design_m: float | None = None
     turned_deg: float | None = None
     expect: int | Mapping[str, int] | None = None
+    scale_free: float = 0.0
 
     def __post_init__(self) -> None:
         if self.region is not None:
@@ -62,6 +67,15 @@ class Priors:
             self.expect.values() if isinstance(self.expect, Mapping) else [1 if self.expect is None else self.expect]
         )
         require(all(count >= 1 for count in counts), "expect", self.expect, "1 or more")
+        free = self.scale_free
+        require(0.0 <= free <= MOST_FREE, "scale_free", free, f"a share from 0 to {MOST_FREE}, such as 0.1")
+        require(not free or near is None, "scale_free", free, "0 where near_design_m says where the design puts things")
+
+    def in_metres(self, scale: float) -> Priors:
+        """The same of scans in metres that had so many metres a unit."""
+        region = None if self.region is None else tuple(scale * x for x in self.region)
+        outline = None if self.outline is None else tuple((scale * x, scale * y) for x, y in self.outline)
+        return replace(self, region=region, outline=outline, scale_free=0.0)  # type: ignore[arg-type]
 
     def check(self, models: Sequence[str], max_instances: int | None) -> None:
         """Raise UsageError where counts are expected of models that are not sought, or more than may be found."""

@@ -88,7 +88,8 @@ def gather(folder: Path, results: Results, models: Sequence[Model], scans: Seque
         notes.append(f"{len(missing)} models are not kept in the result and not drawn, such as {min(missing)!r}.")
     box = _box(results, points, shapes)
     files = list(scans) or list(_unchanged(results, notes))
-    around = _around(files, box, int(OF_SCAN * most)) if files and box is not None else _NOTHING
+    scale = results.scan_scale.metres if results.scan_scale else 1.0
+    around = _around(files, box, int(OF_SCAN * most), scale) if files and box is not None else _NOTHING
     return Material(points, shapes, around, tuple(notes))
 
 
@@ -185,11 +186,14 @@ def _unchanged(results: Results, notes: list[str]) -> Iterator[Path]:
             notes.append(f"The scan {scan.path} is not there or has changed: it is not shown around the found points.")
 
 
-def _around(files: Sequence[Path], box: tuple[Floats, Floats], most: int) -> Points:
-    """About `most` points of the scans within a box, drawn by chance in one pass, and how light each is."""
+def _around(files: Sequence[Path], box: tuple[Floats, Floats], most: int, scale: float) -> Points:
+    """About `most` points of the scans within a box, drawn by chance in one pass, and how light each is.
+
+    scale : metres a unit of the scans
+    """
     kept: list[Points] = []
     rng, chance = np.random.default_rng(0), 1.0
-    for chunk in (chunk for file in files for chunk in read_scan(file)):
+    for chunk in (chunk.scaled(scale) for file in files for chunk in read_scan(file)):
         inside = ((chunk.xyz >= box[0]) & (chunk.xyz <= box[1])).all(axis=1) & (rng.random(len(chunk.xyz)) < chance)
         kept.append(Points(chunk.xyz[inside], _light(chunk)[inside]))
         # How many there will be nobody knows: whenever there are twice too many, half of them go.

@@ -26,6 +26,7 @@ from scanfind.detection import (
     Motion,
     PartFit,
     Refused,
+    ScanScale,
     SceneScan,
     StationSays,
 )
@@ -85,6 +86,7 @@ def document(
         elements=[_element_entry(element) for element in findings.elements],
         profile=None if findings.profile is None else findings.profile.tables(),
         alignment=None if findings.alignment is None else _alignment_entry(findings.alignment),
+        scan_scale=None if findings.scan_scale is None else _scale_entry(findings.scan_scale),
         remainder=remainder,
         notes=list(findings.notes),
         timings_s=timings,
@@ -98,6 +100,7 @@ def findings_of(results: schema.Results) -> Findings:
     findings.refused = [_refused(entry) for entry in results.refused]
     findings.elements = [_element(entry) for entry in results.elements]
     findings.alignment = None if results.alignment is None else _alignment(results.alignment)
+    findings.scan_scale = None if results.scan_scale is None else _scale(results.scan_scale)
     findings.scans = [SceneScan(scan.path, scan.points, scan.dropped, tuple(scan.stations_m)) for scan in results.scans]
     findings.shift, findings.crs, findings.notes = results.shift_m, results.crs, list(results.notes)
     findings.expected = {model.name: model.expected for model in results.models if model.expected is not None}
@@ -288,6 +291,10 @@ def _alignment_entry(alignment: Alignment) -> schema.AlignmentEntry:
     )
 
 
+def _scale_entry(scale: ScanScale) -> schema.ScaleEntry:
+    return schema.ScaleEntry(metres=scale.metres, sigma=_or_none(scale.sigma))
+
+
 def rows(pose: Pose) -> schema.Matrix:
     """A pose as results.json has it."""
     a, b, c, d = (tuple(row) for row in pose.matrix().tolist())
@@ -371,6 +378,10 @@ def _element(entry: schema.ElementEntry) -> Element:
 def _alignment(entry: schema.AlignmentEntry) -> Alignment:
     pose, covariance = _pose(entry.scene_from_design), np.array(entry.covariance)
     return Alignment(pose, covariance, entry.pivot_m, entry.agreeing, entry.found, entry.rms_m)
+
+
+def _scale(entry: schema.ScaleEntry) -> ScanScale:
+    return ScanScale(entry.metres, _or_nan(entry.sigma))
 
 
 def _refused(entry: schema.RefusedEntry) -> Refused:

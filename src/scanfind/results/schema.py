@@ -1,6 +1,7 @@
 """What results.json holds, field by field. `Results.model_json_schema()` gives it as a JSON schema.
 
-Everything is in metres, radians and the scan file's own frame. A number that does not exist is null, never NaN.
+Everything is in metres, radians and the scan file's own frame, scaled to metres where its scale was free. A number that
+does not exist is null, never NaN.
 """
 
 from __future__ import annotations
@@ -269,6 +270,13 @@ class AlignmentEntry(Entry):
     rms_m: float
 
 
+class ScaleEntry(Entry):
+    """`metres` a unit of the scans' coordinates, and its standard deviation; null where nothing told the scale."""
+
+    metres: float
+    sigma: float | None
+
+
 class Results(Entry):
     """results.json. `shift_m` was taken off while computing; every coordinate here has it added back.
 
@@ -276,7 +284,8 @@ class Results(Entry):
     where a search was asked what became of it; `profile` by how much they may be off, as a TOML file says it (see
     docs/report.md). `allowed_m` says so in results of an earlier version: no point of theirs by more. `made`: when this
     was written, UTC as in 2026-11-22T17:30:00Z, null in results of an earlier version. `alignment`: null where scans
-    and design are in one frame.
+    and design are in one frame. `scan_scale`: where the scale of the scans was free; poses, points and all else are in
+    the scans' frame with every coordinate times its `metres`. null: the scans were in metres.
     """
 
     schema_: int = Field(SCHEMA, alias="schema")
@@ -295,6 +304,7 @@ class Results(Entry):
     profile: dict[str, Any] | None = None
     allowed_m: float | None = None
     alignment: AlignmentEntry | None = None
+    scan_scale: ScaleEntry | None = None
     remainder: str | None = None
     notes: list[str] = []
     timings_s: dict[str, float]

@@ -27,12 +27,14 @@ class Source:
     """One file or cloud of the scene, and what reading it told.
 
     expected : records it says it has, -1 where only reading tells
+    scale : metres a unit of its coordinates: chunks and stations are in metres
     """
 
     path: str
     expected: int
     crs: str | None
     read: Callable[[], Iterator[PointChunk]]
+    scale: float = 1.0
     points: int = 0
     dropped: int = 0
     stations: dict[int, tuple[float, float, float] | None] | None = None
@@ -41,7 +43,8 @@ class Source:
         """Every valid point, in order, its scans numbered from `first_scan` on. Counts what it passes."""
         self.points = self.dropped = 0
         self.stations = {}
-        for chunk in self.read():
+        for raw in self.read():
+            chunk = raw if self.scale == 1.0 else raw.scaled(self.scale)
             self.points += len(chunk)
             self.dropped += chunk.dropped
             at = None if chunk.origin is None else (*(float(x) for x in chunk.origin),)
@@ -77,8 +80,13 @@ class Sources:
             first_scan += source.scans()
 
     def crs(self) -> str | None:
-        """The first coordinate reference system a source states."""
-        return next((source.crs for source in self.all if source.crs), None)
+        """The first coordinate reference system a source states; coordinates that were scaled are in none."""
+        return next((source.crs for source in self.all if source.crs and source.scale == 1.0), None)
+
+    def in_metres(self, scale: float) -> None:
+        """From now on all coordinates come times `scale`, metres a unit of the scans."""
+        for source in self.all:
+            source.scale = scale
 
 
 def scans_of(scans: Scan | Sequence[Scan]) -> list[Scan]:

@@ -116,6 +116,9 @@ def find_in_tiles(
     if parameters.assembly.parts:
         msg = "find: parts are not fitted in tiles: leave out --parts, or --memory, --workers and --scheduler"
         raise UsageError(msg)
+    if parameters.priors.scale_free:
+        msg = "find: a free scale is not found in tiles: leave out --scale-free, or --memory, --workers and --scheduler"
+        raise UsageError(msg)
     tell = progress or (lambda stage, done, total: None)
     say_if_compiling(tell)
     clock = Clock()
@@ -193,7 +196,7 @@ def _find(
     left_out = sum(one.unaddressable for one in summed)
     findings.notes = [
         *findings.missing,
-        *findings.as_expected(),
+        *findings.as_known(),
         *dict.fromkeys(note for each in searched for note in each.notes),
     ]
     findings.notes += [f"{left_out} points lie too far from the rest and were left out"] if left_out else []
