@@ -14,7 +14,7 @@ from scanfind.detection import Refused
 from scanfind.evidence.verify import nearest, outlines
 from scanfind.priors.allowed import OUTSIDE
 from scanfind.recognition.by_parts import ByParts
-from scanfind.recognition.candidate import Candidate, Standing, closest
+from scanfind.recognition.candidate import OUTWEIGHED, SHOWS_LESS, Candidate, Standing, closest
 from scanfind.recognition.claims import Claims, stands_elsewhere
 from scanfind.recognition.fitting import Fitting
 from scanfind.recognition.ground import Ground
@@ -187,7 +187,7 @@ class Recognition:
         for candidate in sorted([*self.believed, *fresh], key=lambda c: (not c.in_place, -c.area)):
             free = candidate.in_place  # what adjoins it by design may share its surface
             if not free and (claims.hold(candidate) or stands_elsewhere(candidate, self._standing, ground)):
-                self._refused.append((candidate, "another pose explains more of the same surface"))
+                self._refused.append((candidate, OUTWEIGHED))
                 continue
             best = candidate
             if id(candidate) not in settled:
@@ -215,8 +215,7 @@ class Recognition:
             most[candidate.model] = max(most[candidate.model], candidate.evidence.support())
         alike = [c for c in believed if c.evidence.support() >= BLIND_SHARE * most[c.model]]
         kept = {id(c) for c in alike}
-        reason = "much less of it lies on the scan than of another instance, and no free space is known to tell why"
-        self._refused.extend((c, reason) for c in believed if id(c) not in kept)
+        self._refused.extend((c, SHOWS_LESS) for c in believed if id(c) not in kept)
         return alike
 
     def _hits(self, hypotheses: Hypotheses, found: Candidate) -> int:
