@@ -1,1 +1,1 @@
-"""How often a pose with a score is right: candidates of simulated scenes, a map from score to probability, its error."""
+"""How often a pose of some score is right: candidates of simulated scenes, the curve they make, and how it holds."""

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from benchmarks.calibration.questions import Question
+from benchmarks.common import Floats, PoseError
 from benchmarks.recognition.lines import NOISY_DEG, NOISY_MM
-from benchmarks.recognition.parts import library_of
+from benchmarks.recognition.parts import Part, library_of
 from benchmarks.recognition.sensors import SENSORS as NOISY
 from benchmarks.recognition.trial import RIGHT_DEG, RIGHT_MM, right_deg
 from scanfind.detection import Detection, Refused
 from scanfind.find import find
 from scanfind.parameters import PRESETS
 from scanfind.recognition.candidate import OUTWEIGHED, SHOWS_LESS
+from scanfind.simulate.scene import SceneObject
 
 # A tenth of the preset's: 250 searches in an hour. What a long search refuses in the end is like what it refuses first.
 TIME_LIMIT_S = 6.0
+NAN = float("nan")
 BELIEVED, REFUSED, AGAINST_ANOTHER = "believed", "refused", "outweighed"
 
 
@@ -33,9 +39,14 @@ class Row:
     support: float
     visible_support: float
     penalty: float
+    x_m: float
+    y_m: float
+    z_m: float
     right: int
     error_mm: float
     error_deg: float
+    on: str
+    on_mm: float
     seconds: float
 
     def key(self) -> tuple[int, int]:
@@ -45,29 +56,44 @@ class Row:
 
 def candidates(asked: Question) -> list[Row]:
     """Search, and judge what is told and what is refused, best first: an instance that was told is not right again."""
-    sensor = asked.sensor
-    parameters = PRESETS.get(sensor, PRESETS["default"])
-    parameters = replace(parameters, search=replace(parameters.search, time_limit_s=TIME_LIMIT_S))
+    preset = PRESETS.get(asked.sensor, PRESETS["default"])
+    parameters = replace(preset, search=replace(preset.search, time_limit_s=TIME_LIMIT_S))
     found = find(asked.clouds, library_of(asked.sought), parameters=parameters, seed=asked.seed, jobs=1, isolate=False)
-    told: list[tuple[str, Detection | Refused]] = [(BELIEVED, one) for one in found]
-    for one in sorted(found.refused, key=lambda one: -one.score):
-        told.append((AGAINST_ANOTHER if one.reason in (OUTWEIGHED, SHOWS_LESS) else REFUSED, one))
-    free = [thing for thing in asked.world.objects if thing.name in {part.name for part in asked.sought}]
     parts = {part.name: part for part in asked.sought}
-    most_mm, least_deg = (NOISY_MM, NOISY_DEG) if sensor in NOISY else (RIGHT_MM, RIGHT_DEG)
+    standing = [thing for thing in asked.world.objects if thing.name in parts]
+    untold = list(standing)
+    most_mm, least_deg = (NOISY_MM, NOISY_DEG) if asked.sensor in NOISY else (RIGHT_MM, RIGHT_DEG)
+    refused = sorted(found.refused, key=lambda one: -one.score)
     rows = []
-    for number, (how, one) in enumerate(told):
+    for number, one in enumerate([*found, *refused]):
         part = parts[one.model]
-        errors = [(part.error(one.scene_from_model, thing.pose), thing) for thing in free if thing.name == one.model]
-        error, thing = min(errors, key=lambda pair: pair[0].mm, default=(None, None))
-        right = error is not None and error.within(most_mm, max(least_deg, right_deg(part)))
+        middle = one.scene_from_model.move(part.symmetry.centre[None])[0]
+        own = [thing for thing in untold if thing.name == one.model]
+        errors = [part.error(one.scene_from_model, thing.pose) for thing in own]
+        error = min(errors, key=lambda error: error.mm, default=PoseError(NAN, NAN))
+        right = error.within(most_mm, max(least_deg, right_deg(part)))
         if right:
-            free.remove(thing)
+            untold.remove(own[errors.index(error)])
+        apart = {thing.name: float(np.linalg.norm(middle_of(thing, parts) - middle)) for thing in standing}
+        on = min(apart, key=lambda name: apart[name], default="")
         rows.append(
             Row(
-                asked.seed, number, asked.scene, sensor, one.model, how, one.score, one.support, one.visible_support,
-                one.penalty, int(right), error.mm if error else float("nan"), error.deg if error else float("nan"),
-                found.timings_s["total"],
+                asked.seed, number, asked.scene, asked.sensor, one.model, how_told(one), one.score, one.support,
+                one.visible_support, one.penalty, *middle.tolist(), int(right), error.mm, error.deg, on,
+                1e3 * apart.get(on, NAN), found.timings_s["total"],
             )
         )  # fmt: skip
     return rows
+
+
+def how_told(one: Detection | Refused) -> str:
+    """Told, refused for what the scene says of it, or for what it says of another."""
+    if isinstance(one, Detection):
+        return BELIEVED
+    return AGAINST_ANOTHER if one.reason in {OUTWEIGHED, SHOWS_LESS} else REFUSED
+
+
+def middle_of(thing: SceneObject, parts: Mapping[str, Part]) -> Floats:
+    """The middle (3,) of a part where it stands."""
+    middle: Floats = thing.pose.move(parts[thing.name].symmetry.centre[None])[0]
+    return middle

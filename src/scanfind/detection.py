@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from math import nan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -162,6 +163,8 @@ class Detection:
     slide : (3,) unit direction along which beams that went past its ends, not its faces, say where it stands; None
         where none was asked or none could
     instead_of : the element in whose place it stands, where two were swapped; else empty
+    probability : that it is right, by how often simulated poses of such a score were (see `evidence.confidence`); NaN
+        where nobody measured, and in results of a version that did not know
     """
 
     id: int
@@ -183,6 +186,7 @@ class Detection:
     stations: tuple[StationSays, ...] = ()
     slide: tuple[float, float, float] | None = None
     instead_of: str = ""
+    probability: float = nan
 
     @property
     def sigma_m(self) -> float:
@@ -201,7 +205,7 @@ class Detection:
 
 @dataclass(frozen=True)
 class Refused:
-    """A hypothesis that came close and was not believed, and why, in words."""
+    """A hypothesis that came close and was not believed, and why, in words; probability : see Detection."""
 
     model: str
     scene_from_model: Pose
@@ -210,6 +214,7 @@ class Refused:
     visible_support: float
     penalty: float
     reason: str
+    probability: float = nan
 
 
 @dataclass(frozen=True)

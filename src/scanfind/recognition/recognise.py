@@ -257,6 +257,7 @@ class Recognition:
             Refused(
                 self.models[c.model].name, self.telling.pose(c), c.score, c.evidence.support(),
                 c.evidence.visible_support(), c.evidence.penalty(), reason,
+                self.ground.probability(c, outweighed=reason in {OUTWEIGHED, SHOWS_LESS}),
             )
             for c, reason in [*self._refused, *((c, OUTSIDE) for c in self.believed if id(c) not in reported)]
         ]  # fmt: skip

@@ -35,7 +35,7 @@ class Telling:
 
     def detection(self, number: int, found: Candidate) -> Detection:
         """What is told of something believed, under a number, in the scans' own frame."""
-        whole = found.whole
+        whole, probability = found.whole, self._ground.probability(found)
         if self._ground.parameters.assembly.parts and whole is None:
             whole = self._assemblies.explain(found.model, found.pose(), believed=True)
         if whole is not None:
@@ -52,7 +52,7 @@ class Telling:
             coverage=seen.support(), rms_m=seen.rms, unobservable=self._unobservable(found),
             covariance=covariance_of(found.hessian, found.rms, radius, below) if np.isfinite(found.rms) else None,
             pivot=triple(pivot), instead_of=found.instead_of.name if found.instead_of else "",
-            parts=whole.parts if whole else (),
+            parts=whole.parts if whole else (), probability=probability,
         )  # fmt: skip
 
     def elements(self, number: int, detections: Sequence[Detection], stations: Floats) -> list[Element]:

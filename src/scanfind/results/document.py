@@ -182,6 +182,7 @@ def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -
         dimensions=[_dimension_entry(each) for each in found.dimensions],
         stations=_station_entries(found.stations),
         instead_of=found.instead_of,
+        probability=_or_none(found.probability),
     )
 
 
@@ -243,6 +244,7 @@ def _refused_entry(refused: Refused) -> schema.RefusedEntry:
         visible_support=_or_none(refused.visible_support),
         penalty=_or_none(refused.penalty),
         reason=refused.reason,
+        probability=_or_none(refused.probability),
     )
 
 
@@ -327,6 +329,7 @@ def _detection(entry: schema.DetectionEntry) -> Detection:
         ),
         stations=_stations(entry.stations),
         instead_of=entry.instead_of,
+        probability=_or_nan(entry.probability),
     )
 
 
@@ -382,6 +385,7 @@ def _refused(entry: schema.RefusedEntry) -> Refused:
         visible_support=_or_nan(entry.visible_support),
         penalty=_or_nan(entry.penalty),
         reason=entry.reason,
+        probability=_or_nan(entry.probability),
     )
 
 
