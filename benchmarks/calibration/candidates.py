@@ -16,7 +16,7 @@ from benchmarks.recognition.trial import RIGHT_DEG, RIGHT_MM, right_deg
 from scanfind.detection import Detection, Refused
 from scanfind.find import find
 from scanfind.parameters import PRESETS
-from scanfind.recognition.candidate import OUTWEIGHED, SHOWS_LESS
+from scanfind.recognition.candidate import FOR_ANOTHER
 from scanfind.simulate.scene import SceneObject
 
 # A tenth of the preset's: 250 searches in an hour. What a long search refuses in the end is like what it refuses first.
@@ -39,9 +39,7 @@ class Row:
     support: float
     visible_support: float
     penalty: float
-    x_m: float
-    y_m: float
-    z_m: float
+    rival: float
     right: int
     error_mm: float
     error_deg: float
@@ -79,7 +77,7 @@ def candidates(asked: Question) -> list[Row]:
         rows.append(
             Row(
                 asked.seed, number, asked.scene, asked.sensor, one.model, how_told(one), one.score, one.support,
-                one.visible_support, one.penalty, *middle.tolist(), int(right), error.mm, error.deg, on,
+                one.visible_support, one.penalty, one.rival, int(right), error.mm, error.deg, on,
                 1e3 * apart.get(on, NAN), found.timings_s["total"],
             )
         )  # fmt: skip
@@ -90,7 +88,7 @@ def how_told(one: Detection | Refused) -> str:
     """Told, refused for what the scene says of it, or for what it says of another."""
     if isinstance(one, Detection):
         return BELIEVED
-    return AGAINST_ANOTHER if one.reason in {OUTWEIGHED, SHOWS_LESS} else REFUSED
+    return AGAINST_ANOTHER if one.reason in FOR_ANOTHER else REFUSED
 
 
 def middle_of(thing: SceneObject, parts: Mapping[str, Part]) -> Floats:

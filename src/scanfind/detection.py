@@ -163,6 +163,7 @@ class Detection:
     slide : (3,) unit direction along which beams that went past its ends, not its faces, say where it stands; None
         where none was asked or none could
     instead_of : the element in whose place it stands, where two were swapped; else empty
+    rival : the best score among poses of the same surface that were refused in its favour; NaN where there is none
     probability : that it is right, by how often simulated poses of such a score were (see `evidence.confidence`); NaN
         where nobody measured, and in results of a version that did not know
     """
@@ -186,6 +187,7 @@ class Detection:
     stations: tuple[StationSays, ...] = ()
     slide: tuple[float, float, float] | None = None
     instead_of: str = ""
+    rival: float = nan
     probability: float = nan
 
     @property
@@ -205,7 +207,10 @@ class Detection:
 
 @dataclass(frozen=True)
 class Refused:
-    """A hypothesis that came close and was not believed, and why, in words; probability : see Detection."""
+    """A hypothesis that came close and was not believed, and why, in words.
+
+    rival : the best score among what is told of the same surface, NaN where there is nothing; probability : see Detection
+    """
 
     model: str
     scene_from_model: Pose
@@ -214,6 +219,7 @@ class Refused:
     visible_support: float
     penalty: float
     reason: str
+    rival: float = nan
     probability: float = nan
 
 

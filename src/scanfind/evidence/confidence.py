@@ -33,9 +33,10 @@ BLIND = Curve((0.1, 0.5, 0.9, 1.0), (0.01, 0.05, 0.5, 0.98))
 OUTWEIGHED = Curve((0.1, 0.5, 0.9, 1.0), (0.01, 0.05, 0.1, 0.1))
 
 
-def probability(score: float, *, blind: bool, outweighed: bool) -> float:
+def probability(score: float, rival: float, *, blind: bool, outweighed: bool) -> float:
     """That a model is there, at a pose of this score, and was not told before.
 
+    rival : the best score among other poses of the same surface, NaN where there is none
     blind : no scanner position is known; outweighed : another pose was told in its stead
     """
     return (OUTWEIGHED if outweighed else BLIND if blind else SEEN).at(score)

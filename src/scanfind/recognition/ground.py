@@ -81,15 +81,15 @@ class Ground:
         """Why the evidence does not carry a pose found anywhere; empty where it does."""
         return why_refused(candidate.evidence, self.blind, self.parameters.verify)
 
-    def probability(self, candidate: Candidate, *, outweighed: bool = False) -> float:
-        """How likely a pose is right; outweighed : another one was told instead of it.
+    def probability(self, candidate: Candidate, rival: float, *, outweighed: bool = False) -> float:
+        """How likely a pose is right; rival : see Detection; outweighed : another one was told instead of it.
 
         NaN where nobody measured: in its place by design, believed by its parts, of a piece of scan, weighed otherwise.
         """
         other = candidate.in_place or candidate.whole is not None or candidate.evidence.rough
         if other or not weighed_as_measured(self.parameters.verify):
             return nan
-        return probability(candidate.score, blind=self.blind, outweighed=outweighed)
+        return probability(candidate.score, rival, blind=self.blind, outweighed=outweighed)
 
     def why_not_believed(self, candidate: Candidate) -> str:
         """Why the one or the other speaks against a pose; empty where neither does."""
