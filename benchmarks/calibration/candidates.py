@@ -19,8 +19,8 @@ from scanfind.parameters import PRESETS
 from scanfind.recognition.candidate import FOR_ANOTHER
 from scanfind.simulate.scene import SceneObject
 
-# A tenth of the preset's: 250 searches in an hour. What a long search refuses in the end is like what it refuses first.
-TIME_LIMIT_S = 6.0
+# 250 searches in an hour: what a long search refuses in the end is much like what it refuses first.
+MISSED, TIME_LIMIT_S = 0.1, 10.0
 NAN = float("nan")
 BELIEVED, REFUSED, AGAINST_ANOTHER = "believed", "refused", "outweighed"
 
@@ -55,7 +55,8 @@ class Row:
 def candidates(asked: Question) -> list[Row]:
     """Search, and judge what is told and what is refused, best first: an instance that was told is not right again."""
     preset = PRESETS.get(asked.sensor, PRESETS["default"])
-    parameters = replace(preset, search=replace(preset.search, time_limit_s=TIME_LIMIT_S))
+    search = replace(preset.search, deeper=False, miss_probability=MISSED, time_limit_s=TIME_LIMIT_S)
+    parameters = replace(preset, search=search)
     found = find(asked.clouds, library_of(asked.sought), parameters=parameters, seed=asked.seed, jobs=1, isolate=False)
     parts = {part.name: part for part in asked.sought}
     standing = [thing for thing in asked.world.objects if thing.name in parts]

@@ -209,7 +209,8 @@ class Detection:
 class Refused:
     """A hypothesis that came close and was not believed, and why, in words.
 
-    rival : the best score among what is told of the same surface, NaN where there is nothing; probability : see Detection
+    rival : the best score among what is told of the same surface, NaN where there is nothing
+    probability : see Detection
     """
 
     model: str
