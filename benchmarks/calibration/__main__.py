@@ -1,7 +1,8 @@
-"""Rows of candidates, and what is made of them.
+"""Candidates of simulated scenes, and the curves they make.
 
-python -m benchmarks.calibration --part fit            # seeds 8000-8159: what the map is made from
-python -m benchmarks.calibration --part held           # seeds 9000-9099: what it is held against
+python -m benchmarks.calibration --part fit       # the scenes the curves are made from
+python -m benchmarks.calibration --part held      # those they are held against
+python -m benchmarks.calibration --part curves    # from the rows of fit what evidence.confidence.CURVES are to be
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ from pathlib import Path
 import cyclopts
 
 from benchmarks.calibration.candidates import Row, candidates
+from benchmarks.calibration.fit import curves
 from benchmarks.calibration.questions import question
 from benchmarks.common import RESULTS, seeds_of
-from benchmarks.ledger import Ledger
+from benchmarks.ledger import Ledger, read_rows
 from benchmarks.paper.systems import warm_up
 from scanfind.errors import ScanfindError
 
@@ -24,14 +26,17 @@ SEEDS = {"fit": "8000-8159", "held": "9000-9099"}
 
 
 def main(part: str = "fit", seeds: str = "", out: Path = RESULTS, *, fresh: bool = False, date: str = "") -> None:
-    """Search the scenes of one part; seeds already there are not searched again.
+    """Search the scenes of one part; seeds already there are not searched again. Or print the curves.
 
-    :param part: fit or held.
+    :param part: fit, held or curves.
     :param seeds: of the scenes; left out, those of the part.
     :param out: folder for calibration_<part>.csv.
     :param fresh: replace what is there.
     :param date: written to the CSV.
     """
+    if part == "curves":
+        print(*curves(read_rows(Row, out / "calibration_fit.csv")[1]).items(), sep="\n")
+        return
     warm_up()
     ledger = Ledger(Row, out / f"calibration_{part}.csv", date, fresh)
     done = {row.seed for row in ledger.rows}

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
+from math import isnan
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.calibration.candidates import AGAINST_ANOTHER, Row
+from benchmarks.calibration.candidates import AGAINST_ANOTHER, REFUSED, Row
 from benchmarks.common import Floats
 from scanfind.evidence.confidence import CURVES, Curve, curve_of
-
-# Of fewer candidates a share says little: 20 of which all are right are right with 0.98 ± 0.03.
-LEAST = 20
 
 
 def curves(rows: Sequence[Row]) -> dict[str, Curve]:
@@ -22,7 +21,8 @@ def curves(rows: Sequence[Row]) -> dict[str, Curve]:
 
 def named(row: Row) -> str:
     """Which curve a row is of."""
-    return curve_of(row.score, row.rival, blind=row.sensor == "blind", outweighed=row.told == AGAINST_ANOTHER)
+    outweighed = row.told == AGAINST_ANOTHER or (row.told == REFUSED and not isnan(row.rival))
+    return curve_of(row.score, row.rival, blind=row.sensor == "blind", outweighed=outweighed)
 
 
 def probability(row: Row) -> float:
@@ -31,39 +31,46 @@ def probability(row: Row) -> float:
 
 
 def curve(rows: Sequence[Row]) -> Curve:
-    """The isotonic curve through rows: level over each group of neighbours that share a share.
-
-    Groups begin as LEAST neighbours by score, or more. To each a half is added that was right and a half that was not
-    (Jeffreys): of however many none was wrong, the next may be.
-    """
-    ranked = sorted(rows, key=lambda row: row.score)
-    groups = [list(some) for some in np.array_split(np.arange(len(ranked)), max(1, len(ranked) // LEAST)) if len(some)]
-    pooled: list[list[int]] = []
-    for group in groups:
-        pooled.append(group)
-        while len(pooled) > 1 and share(ranked, pooled[-2]) >= share(ranked, pooled[-1]):
+    """The isotonic curve through rows: level over each group of neighbours that have one share."""
+    pooled: list[list[Row]] = []
+    for _, tied in groupby(sorted(rows, key=score), key=score):
+        pooled.append(list(tied))
+        while len(pooled) > 1 and not rises(*pooled[-2:]):
             last = pooled.pop()
-            pooled[-1] = pooled[-1] + last
+            pooled[-1] += last
     knots: dict[float, float] = {}
     for group in pooled:
         for end in (group[0], group[-1]):
-            knots.setdefault(round(ranked[end].score, 4), round(share(ranked, group), 3))
+            knots.setdefault(round(end.score, 4), round(share(group), 3))
     return Curve(tuple(knots), tuple(knots.values()))
 
 
-def share(rows: Sequence[Row], group: Sequence[int]) -> float:
-    """Of a group of rows, by number, the share that is right."""
-    return (sum(rows[k].right for k in group) + 0.5) / (len(group) + 1.0)
+def score(row: Row) -> float:
+    """By what rows are ranked."""
+    return row.score
 
 
-def bins(told: Floats, right: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
+def rises(lower: Sequence[Row], upper: Sequence[Row]) -> bool:
+    """Is more of a group right than of the one below it, and would be if little were known of them?"""
+    means = [sum(row.right for row in group) / len(group) for group in (lower, upper)]
+    return means[0] < means[1] and share(lower) < share(upper)
+
+
+def share(group: Sequence[Row]) -> float:
+    """How much of a group is right, and half a candidate besides, and half a one wrong (Jeffreys): of however many none
+    was wrong, the next may be.
+    """
+    return (sum(row.right for row in group) + 0.5) / (len(group) + 1.0)
+
+
+def bins(told: Floats, count: int) -> list[NDArray[np.int64]]:
     """The candidates (numbers) in so many bins of equally many, by what was told."""
     return np.array_split(np.argsort(told, kind="stable"), count)
 
 
 def expected_error(told: Floats, right: NDArray[np.int64], count: int) -> float:
     """Expected calibration error (Naeini et al. 2015): mean over the candidates of |told − right| of their bin."""
-    parts = bins(told, right, count)
+    parts = bins(told, count)
     return float(sum(len(k) * abs(told[k].mean() - right[k].mean()) for k in parts if len(k)) / len(told))
 
 

@@ -1,4 +1,4 @@
-"""What is asked, from a seed: a kind of scene, an instrument, three likenesses sought, of which two at most are there."""
+"""What is asked, from a seed: a kind of scene, an instrument, three likenesses sought, two of them there at most."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def curve_of(score: float, rival: float, *, blind: bool, outweighed: bool) -> st
     """Which curve a pose is read from.
 
     rival : the best score among other poses of the same surface, NaN where there is none
-    blind : no scanner position is known; outweighed : another pose was told in its stead
+    blind : no scanner position is known; outweighed : it was refused, and another pose is told of its surface
     """
     if abs(score - rival) <= AS_GOOD or (rival > score and not outweighed):
         return CONTESTED

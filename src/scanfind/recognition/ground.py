@@ -82,7 +82,7 @@ class Ground:
         return why_refused(candidate.evidence, self.blind, self.parameters.verify)
 
     def probability(self, candidate: Candidate, rival: float, *, outweighed: bool = False) -> float:
-        """How likely a pose is right; rival : see Detection; outweighed : another one was told instead of it.
+        """How likely a pose is right; rival : see Detection; outweighed : see `curve_of`.
 
         NaN where nobody measured: in its place by design, believed by its parts, of a piece of scan, weighed otherwise.
         """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from math import log, nan
+from math import isnan, log, nan
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -258,7 +258,7 @@ class Recognition:
             Refused(
                 self.models[c.model].name, self.telling.pose(c), c.score, c.evidence.support(),
                 c.evidence.visible_support(), c.evidence.penalty(), reason, rival := self.rival(c),
-                self.ground.probability(c, rival, outweighed=reason in FOR_ANOTHER),
+                self.ground.probability(c, rival, outweighed=reason in FOR_ANOTHER or not isnan(rival)),
             )
             for c, reason in refused
         ]  # fmt: skip
