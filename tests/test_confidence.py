@@ -65,6 +65,7 @@ def test_which_curve_a_pose_is_read_from() -> None:
     assert curve_of(0.99, 0.95, blind=False, outweighed=False) == SEEN
     assert curve_of(0.95, 0.99, blind=False, outweighed=True) == OUTWEIGHED
     assert curve_of(0.95, nan, blind=False, outweighed=True) == OUTWEIGHED
+    assert curve_of(1.0, 1.0, blind=True, outweighed=False) == BLIND
     for outweighed in (False, True):
         assert curve_of(0.95, 0.95 - 0.9 * AS_GOOD, blind=False, outweighed=outweighed) == CONTESTED
         assert curve_of(0.95, 0.95 + 0.9 * AS_GOOD, blind=False, outweighed=outweighed) == CONTESTED

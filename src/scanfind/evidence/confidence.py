@@ -49,9 +49,11 @@ def curve_of(score: float, rival: float, *, blind: bool, outweighed: bool) -> st
     rival : the best score among other poses of the same surface, NaN where there is none
     blind : no scanner position is known; outweighed : it was refused, and another pose is told of its surface
     """
+    if blind:  # a score of all that is expected says nothing of who shows more
+        return OUTWEIGHED if outweighed else BLIND
     if abs(score - rival) <= AS_GOOD or (rival > score and not outweighed):
         return CONTESTED
-    return OUTWEIGHED if outweighed else BLIND if blind else SEEN
+    return OUTWEIGHED if outweighed else SEEN
 
 
 def weighed_as_measured(parameters: VerifyParameters) -> bool:
