@@ -69,7 +69,7 @@ def section(parts: dict[str, Measured]) -> str:
             "Detections, by scene and by sensor:\n",
             shares(told, lambda row: row.scene),
             shares(told, lambda row: row.sensor),
-            "What a threshold lets by, over all seeds (the curves say nothing here, so none need be held out):\n",
+            "What a threshold lets by, over all seeds, fitted and held out, for no curve has a say in it:\n",
             thresholds([row for part in parts.values() for row in part.rows]),
             "Where the rows come from:\n",
             *origins,
@@ -128,7 +128,7 @@ def thresholds(rows: Sequence[Row]) -> str:
 
 
 def searches(rows: Sequence[Row]) -> int:
-    """How many searches rows come from; one that had no candidate at all left none."""
+    """How many searches rows come from; of one that had no candidate there is none."""
     return len({row.seed for row in rows})
 
 
