@@ -16,6 +16,7 @@ import scanfind.scans.sources
 from scanfind.cloud import PointCloud
 from scanfind.detection import Findings
 from scanfind.errors import InvalidGeometryError, ScanfindError, UnreadableFileError, UsageError
+from scanfind.evidence.confidence import CURVES, SEEN
 from scanfind.find import find
 from scanfind.grid.scene import GridParameters
 from scanfind.library import ModelLibrary
@@ -227,6 +228,7 @@ def test_every_detection_is_believed_for_a_reason(two: Findings) -> None:
     for one in two:
         assert one.score >= QUICK.verify.min_score
         assert one.support >= QUICK.verify.min_support
+        assert one.probability == CURVES[SEEN].at(one.score)
 
 
 def test_it_is_found_without_a_scanner_s_position() -> None:

@@ -6,6 +6,7 @@ import csv
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from math import isnan
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +62,8 @@ def findings(tmp_path: Path) -> Findings:
     scan = tmp_path / "shop.xyz"
     scan.write_text("1 2 3\n")
     found = Findings([_detection(1, "Rohr Ø 168/4", rng, 50), _detection(2, "Rohr Ø 168/4", rng, 0)])
-    found.refused = [Refused("frame", _pose(rng), 0.3, 0.4, 0.5, float("nan"), "seen through at 12 % of its surface")]
+    why = "seen through at 12 % of its surface"
+    found.refused = [Refused("frame", _pose(rng), 0.3, 0.4, 0.5, float("nan"), why, 0.9, 0.01)]
     found.scans = [SceneScan(str(scan), 1_000, 17, ((1.0, 2.0, 3.0), None))]
     found.shift, found.crs, found.notes = (650_000.0, 5_100_000.0, 0.0), None, ["one scan has no origin"]
     found.tolerance_m = 0.01
@@ -91,7 +93,7 @@ def _detection(number: int, model: str, rng: np.random.Generator, points: int) -
     found = Detection(number, model, pose, 0.9, 0.6, 0.95, 0.01, 0.55, 0.0012, free, isolated, deviation)
     root = rng.normal(0, 1e-4, (6, 6))
     pivot = tuple(pose.translation.tolist())
-    return replace(found, covariance=root @ root.T, pivot=pivot) if points else found
+    return replace(found, covariance=root @ root.T, pivot=pivot, probability=0.97) if points else found
 
 
 def test_results_json_keeps_the_promised_schema(tmp_path: Path, findings: Findings, models: ModelLibrary) -> None:
@@ -145,6 +147,15 @@ def test_what_is_uncertain_is_read_back_to_the_last_bit(findings: Findings, mode
     np.testing.assert_array_equal(np.array(again[0].covariance), np.array(findings[0].covariance))
     for mine, theirs in zip(findings, again, strict=True):
         assert (mine.pivot, mine.unobservable) == (theirs.pivot, theirs.unobservable)
+
+
+def test_results_of_before_there_were_probabilities_are_read(findings: Findings, models: ModelLibrary) -> None:
+    told = json.loads(document(findings, models=model_entries(models), parameters=Settings(), seed=3).to_json())
+    assert [entry["probability"] for entry in told["detections"] + told["refused"]] == [0.97, None, 0.01]
+    for entry in told["detections"] + told["refused"]:
+        del entry["probability"], entry["rival"]
+    older = findings_of(schema.Results.model_validate(told))
+    assert all(isnan(one.probability) and isnan(one.rival) for one in [*older, *older.refused])
 
 
 def test_poses_read_back_lie_in_memory_as_the_search_makes_them(findings: Findings, models: ModelLibrary) -> None:

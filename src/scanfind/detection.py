@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from math import isnan
+from math import isnan, nan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -163,6 +163,9 @@ class Detection:
     slide : (3,) unit direction along which beams that went past its ends, not its faces, say where it stands; None
         where none was asked or none could
     instead_of : the element in whose place it stands, where two were swapped; else empty
+    rival : the best score among poses of the same surface that were refused in its favour; NaN where there is none
+    probability : that it is right, by how often simulated poses of such a score were (see `evidence.confidence`); NaN
+        where nobody measured, and in results of a version that did not know
     """
 
     id: int
@@ -184,6 +187,8 @@ class Detection:
     stations: tuple[StationSays, ...] = ()
     slide: tuple[float, float, float] | None = None
     instead_of: str = ""
+    rival: float = nan
+    probability: float = nan
 
     @property
     def sigma_m(self) -> float:
@@ -202,7 +207,11 @@ class Detection:
 
 @dataclass(frozen=True)
 class Refused:
-    """A hypothesis that came close and was not believed, and why, in words."""
+    """A hypothesis that came close and was not believed, and why, in words.
+
+    rival : the best score among what is told of the same surface, NaN where there is nothing
+    probability : see Detection
+    """
 
     model: str
     scene_from_model: Pose
@@ -211,6 +220,8 @@ class Refused:
     visible_support: float
     penalty: float
     reason: str
+    rival: float = nan
+    probability: float = nan
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from scanfind.simulate import Sight
 
 FOUND = (
-    "id", "model", "x m", "y m", "z m", "yaw °", "pitch °", "roll °", "score", "visible %", "rms mm", "± mm", "± °",
-    "points", "mean mm", "95 % mm", "free to",
+    "id", "model", "x m", "y m", "z m", "yaw °", "pitch °", "roll °", "score", "right %", "visible %", "rms mm", "± mm",
+    "± °", "points", "mean mm", "95 % mm", "free to",
 )  # fmt: skip
 
 ELEMENTS = ("element", "class", "status", "verdict", "id", "off mm", "x mm", "y mm", "z mm", "turned °", "why")
@@ -147,6 +147,7 @@ def _found_row(found: DetectionEntry) -> list[str]:
         *(_number(value, 3) for value in found.translation_m),
         *(_number(value, 2) for value in turned(found.scene_from_model)),
         _number(found.score, 2),
+        _number(found.probability, 0, 100.0),
         _number(found.visible_support, 0, 100.0),
         _number(found.rms_m, 1, 1e3),
         _number(found.sigma_m, 2, 1e3),

@@ -19,6 +19,11 @@ Floats = NDArray[np.float64]
 
 REFUSED_SHOWN = 3  # of each model: what came closest
 
+# Refused not for what the scene says of a pose, but for what it says of another one.
+OUTWEIGHED = "another pose explains more of the same surface"
+SHOWS_LESS = "much less of it lies on the scan than of another instance, and no free space is known to tell why"
+FOR_ANOTHER = frozenset({OUTWEIGHED, SHOWS_LESS})
+
 
 class Candidate(NamedTuple):
     """A refined pose with what the scene says of it.

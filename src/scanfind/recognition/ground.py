@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import nan
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.evidence.confidence import probability, weighed_as_measured
 from scanfind.evidence.verify import why_refused
 from scanfind.pose import Pose
 from scanfind.priors.allowed import why_not
@@ -78,6 +80,16 @@ class Ground:
     def why_refused(self, candidate: Candidate) -> str:
         """Why the evidence does not carry a pose found anywhere; empty where it does."""
         return why_refused(candidate.evidence, self.blind, self.parameters.verify)
+
+    def probability(self, candidate: Candidate, rival: float, *, outweighed: bool = False) -> float:
+        """How likely a pose is right; rival : see Detection; outweighed : see `curve_of`.
+
+        NaN where nobody measured: in its place by design, believed by its parts, of a piece of scan, weighed otherwise.
+        """
+        other = candidate.in_place or candidate.whole is not None or candidate.evidence.rough
+        if other or not weighed_as_measured(self.parameters.verify):
+            return nan
+        return probability(candidate.score, rival, blind=self.blind, outweighed=outweighed)
 
     def why_not_believed(self, candidate: Candidate) -> str:
         """Why the one or the other speaks against a pose; empty where neither does."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from math import log
+from math import isnan, log, nan
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +14,7 @@ from scanfind.detection import Refused
 from scanfind.evidence.verify import nearest, outlines
 from scanfind.priors.allowed import OUTSIDE
 from scanfind.recognition.by_parts import ByParts
-from scanfind.recognition.candidate import Candidate, Standing, closest
+from scanfind.recognition.candidate import FOR_ANOTHER, OUTWEIGHED, SHOWS_LESS, Candidate, Standing, closest
 from scanfind.recognition.claims import Claims, stands_elsewhere
 from scanfind.recognition.fitting import Fitting
 from scanfind.recognition.ground import Ground
@@ -193,7 +193,7 @@ class Recognition:
         for candidate in sorted([*self.believed, *fresh], key=lambda c: (not c.in_place, -c.area)):
             free = candidate.in_place  # what adjoins it by design may share its surface
             if not free and (claims.hold(candidate) or stands_elsewhere(candidate, self._standing, ground)):
-                self._refused.append((candidate, "another pose explains more of the same surface"))
+                self._refused.append((candidate, OUTWEIGHED))
                 continue
             best = candidate
             if id(candidate) not in settled:
@@ -221,8 +221,7 @@ class Recognition:
             most[candidate.model] = max(most[candidate.model], candidate.evidence.support())
         alike = [c for c in believed if c.evidence.support() >= BLIND_SHARE * most[c.model]]
         kept = {id(c) for c in alike}
-        reason = "much less of it lies on the scan than of another instance, and no free space is known to tell why"
-        self._refused.extend((c, reason) for c in believed if id(c) not in kept)
+        self._refused.extend((c, SHOWS_LESS) for c in believed if id(c) not in kept)
         return alike
 
     def _hits(self, hypotheses: Hypotheses, found: Candidate) -> int:
@@ -260,13 +259,31 @@ class Recognition:
     def refused(self) -> list[Refused]:
         """What came closest of each model and why it was not believed."""
         reported = {id(c) for c in self.reported()}
+        refused = [*self._refused, *((c, OUTSIDE) for c in self.believed if id(c) not in reported)]
         return [
             Refused(
                 self.models[c.model].name, self.telling.pose(c), c.score, c.evidence.support(),
-                c.evidence.visible_support(), c.evidence.penalty(), reason,
+                c.evidence.visible_support(), c.evidence.penalty(), reason, rival := self.rival(c),
+                self.ground.probability(c, rival, outweighed=reason in FOR_ANOTHER or not isnan(rival)),
             )
-            for c, reason in [*self._refused, *((c, OUTSIDE) for c in self.believed if id(c) not in reported)]
+            for c, reason in refused
         ]  # fmt: skip
+
+    def rival(self, candidate: Candidate) -> float:
+        """The best score among other poses of the same surface, NaN where there is none: of one that is believed those
+        refused in its favour, of one refused those believed.
+        """
+        believed = any(one is candidate for one in self.believed)
+        others = [c for c, reason in self._refused if reason in FOR_ANOTHER] if believed else self.believed
+        return max((c.score for c in others if self._rivals(c, candidate)), default=nan)
+
+    def _rivals(self, one: Candidate, other: Candidate) -> bool:
+        """Do two poses that are not one share more of their surface than two instances may?"""
+        if one.model == other.model and self.ground.apart(one, other) < self.fitting.apart[one.model]:
+            return False
+        mine, theirs = one.evidence.claims, other.evidence.claims
+        common = len(np.intersect1d(mine, theirs, assume_unique=True))
+        return common > self.ground.parameters.verify.shared * max(1, min(len(mine), len(theirs)))
 
     def noise(self) -> float:
         """Spread of the raw points about the surfels that support what was found (or about all), metres."""

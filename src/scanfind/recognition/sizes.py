@@ -103,7 +103,7 @@ class Sizes:
         believed = [(candidate, search) for search in self.all for candidate in search.reported()]
         believed.sort(key=lambda one: (-round(one[0].score, 3), -one[0].area))
         return [
-            search.telling.detection(number, candidate)
+            search.telling.detection(number, candidate, search.rival(candidate))
             for number, (candidate, search) in enumerate(believed[: self._parameters.search.max_instances], start=1)
         ]
 

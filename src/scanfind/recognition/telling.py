@@ -27,9 +27,9 @@ class Telling:
         self._ground, self._assemblies = ground, assemblies
         self._in_parts: dict[int, tuple[int, Explained]] = {}
 
-    def detection(self, number: int, found: Candidate) -> Detection:
-        """What is told of something believed, under a number, in the scans' own frame."""
-        whole = found.whole
+    def detection(self, number: int, found: Candidate, rival: float) -> Detection:
+        """What is told of something believed, under a number, in the scans' own frame; rival : see Detection."""
+        whole, probability = found.whole, self._ground.probability(found, rival)
         if self._ground.parameters.assembly.parts and whole is None:
             whole = self._assemblies.explain(found.model, found.pose(), believed=True)
         if whole is not None:
@@ -46,7 +46,7 @@ class Telling:
             coverage=seen.support(), rms_m=seen.rms, unobservable=self._unobservable(found),
             covariance=covariance_of(found.hessian, found.rms, radius, below) if np.isfinite(found.rms) else None,
             pivot=triple(pivot), instead_of=found.instead_of.name if found.instead_of else "",
-            parts=whole.parts if whole else (),
+            parts=whole.parts if whole else (), rival=rival, probability=probability,
         )  # fmt: skip
 
     def built(self) -> dict[int, Floats]:

@@ -182,6 +182,7 @@ def _of_instance(found: DetectionEntry | None) -> list[tuple[str, str]]:
     deviation = found.deviation
     return [
         ("Score", "–" if found.score is None else f"{found.score:.2f}"),
+        ("Right with a probability of", _share(found.probability)),
         ("Surface that the scan shows", _share(found.coverage)),
         ("Points of its own", f"{found.points:,}"),
         ("Points from the surface, mean", _mm(None if deviation is None else deviation.mean_m)),

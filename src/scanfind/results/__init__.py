@@ -269,7 +269,7 @@ def _write_points(path: Path, instance: int, points: IsolatedPoints, findings: F
 CSV_COLUMNS = (
     "id", "model", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "score", "support", "visible_support", "penalty",
     "coverage", "rms_m", "sigma_m", "sigma_deg", "points", "deviation_mean_m", "deviation_rms_m", "deviation_p95_m",
-    "deviation_worst_m", "unobservable", "isolated",
+    "deviation_worst_m", "unobservable", "isolated", "probability",
 )  # fmt: skip
 
 
@@ -293,7 +293,7 @@ def _write_csv(path: Path, results: schema.Results) -> None:
                     found.points,
                 ]
                 + ([""] * 4 if deviation is None else list(deviation.model_dump().values()))
-                + [" ".join(motion.kind for motion in found.unobservable), found.isolated or ""]
+                + [" ".join(motion.kind for motion in found.unobservable), found.isolated or "", found.probability]
             )
 
 

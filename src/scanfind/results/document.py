@@ -185,6 +185,8 @@ def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -
         dimensions=[_dimension_entry(each) for each in found.dimensions],
         stations=_station_entries(found.stations),
         instead_of=found.instead_of,
+        rival=_or_none(found.rival),
+        probability=_or_none(found.probability),
     )
 
 
@@ -246,6 +248,8 @@ def _refused_entry(refused: Refused) -> schema.RefusedEntry:
         visible_support=_or_none(refused.visible_support),
         penalty=_or_none(refused.penalty),
         reason=refused.reason,
+        rival=_or_none(refused.rival),
+        probability=_or_none(refused.probability),
     )
 
 
@@ -334,6 +338,8 @@ def _detection(entry: schema.DetectionEntry) -> Detection:
         ),
         stations=_stations(entry.stations),
         instead_of=entry.instead_of,
+        rival=_or_nan(entry.rival),
+        probability=_or_nan(entry.probability),
     )
 
 
@@ -393,6 +399,8 @@ def _refused(entry: schema.RefusedEntry) -> Refused:
         visible_support=_or_nan(entry.visible_support),
         penalty=_or_nan(entry.penalty),
         reason=entry.reason,
+        rival=_or_nan(entry.rival),
+        probability=_or_nan(entry.probability),
     )
 
 

@@ -176,6 +176,11 @@ class DetectionEntry(Entry):
     extents. They are empty for pieces of scan and free forms, and in results of an earlier version. `stations`: of
     where it was found; empty where there are not several. `instead_of`: the element of the design in whose place it
     stands, where two were swapped.
+
+    `rival`: the best score among poses of the same surface that were refused in its favour, null where there is none.
+    `probability`: that the model is there, at this pose; docs/score.md says what it was measured on. null where nobody
+    measured: at a design's place, by parts, of a piece of scan, with weights of one's own; and in results of an earlier
+    version.
     """
 
     id: int
@@ -202,10 +207,15 @@ class DetectionEntry(Entry):
     dimensions: list[DimensionEntry] = []
     stations: list[StationEntry] = []
     instead_of: str = ""
+    rival: float | None = None
+    probability: float | None = None
 
 
 class RefusedEntry(Entry):
-    """A hypothesis that came close, and why it was not believed."""
+    """A hypothesis that came close, and why it was not believed.
+
+    `rival`: the best score among what is told of the same surface; `probability`: see DetectionEntry.
+    """
 
     model: str
     scene_from_model: Matrix
@@ -214,6 +224,8 @@ class RefusedEntry(Entry):
     visible_support: float | None
     penalty: float | None
     reason: str
+    rival: float | None = None
+    probability: float | None = None
 
 
 class ElementEntry(Entry):
