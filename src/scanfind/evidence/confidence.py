@@ -2,7 +2,7 @@
 
 The curves are what `python -m benchmarks.calibration --part curves` makes of benchmarks/results/calibration_fit.csv
 (isotonic regression: Ayer et al. 1955; Zadrozny & Elkan 2002). docs/score.md says of which scenes, and how well they
-hold on others; decision 23 why it is curves.
+hold on others; decision 25 why it is curves.
 """
 
 from __future__ import annotations
