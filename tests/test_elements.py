@@ -89,6 +89,26 @@ def test_each_detection_is_taken_for_the_place_nearest_to_it_and_once() -> None:
     assert {place: one.id for place, one in taken.items()} == {1: 1, 0: 2}
 
 
+@given(st.integers(0, 2**32 - 1), st.integers(0, 8), st.integers(1, 8))
+@settings(max_examples=50, deadline=None)
+def test_of_all_pairs_the_nearest_are_taken_first(seed: int, count: int, wanted: int) -> None:
+    rng, model = np.random.default_rng(seed), build_model(BRACKET, SMALL)
+    poses = [Pose(random_rotation(rng), rng.normal(size=3)) for _ in range(count + wanted)]
+    places = placed(BRACKET, *poses[count:]).placements
+    found = [detection(number, pose) for number, pose in enumerate(poses[:count])]
+    some = model.samples.points[:50]
+    pairs = sorted(
+        (off_by(model, some, one.scene_from_model, place.design_from_model), k, one.id)
+        for k, place in enumerate(places)
+        for one in found
+    )
+    expected: dict[int, int] = {}
+    for _, place, number in pairs:
+        if place not in expected and number not in expected.values():
+            expected[place] = number
+    assert {place: one.id for place, one in assigned(model, places, found).items()} == expected
+
+
 def test_a_turn_onto_itself_is_no_displacement() -> None:
     rod = build_model(cylinder(0.05, 1.0), SMALL)
     points = rod.samples.points

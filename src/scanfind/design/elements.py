@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from heapq import heappop, heappush
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -110,19 +111,27 @@ def elements_of(
 
 def assigned(model: Model, placements: Sequence[Placement], detections: Iterable[Detection]) -> dict[int, Detection]:
     """Which detection is taken for which placement (by number): the nearest pair first, each once."""
-    some = model.samples.points[:PAIRED_BY]
-    pairs = sorted(
-        (
-            (off_by(model, some, one.scene_from_model, placement.design_from_model), place, one.id, one)
-            for place, placement in enumerate(placements)
-            for one in detections
-        ),
-        key=lambda pair: pair[:3],
-    )
+    listed, some, centre = list(detections), model.samples.points[:PAIRED_BY], model.symmetry.centre[None]
+    there = np.array([placement.design_from_model.move(centre)[0] for placement in placements]).reshape(-1, 1, 3)
+    here = np.array([one.scene_from_model.move(centre)[0] for one in listed]).reshape(-1, 3)
+    # Between its points, so the farthest of these is off by more: most pairs are never looked at closely.
+    least = np.linalg.norm(there - here, axis=2)
     taken: dict[int, Detection] = {}
-    for _, place, _, one in pairs:
-        if place not in taken and all(one is not other for other in taken.values()):
-            taken[place] = one
+    free, pairs = set(range(len(listed))), list[tuple[float, int, int, int]]()
+
+    def settle(nearer_than: float) -> None:
+        while pairs and pairs[0][0] < nearer_than:
+            _, place, _, number = heappop(pairs)
+            if place not in taken and number in free:
+                taken[place] = listed[number]
+                free.remove(number)
+
+    for place, number in np.column_stack(np.unravel_index(np.argsort(least, axis=None, kind="stable"), least.shape)):
+        settle(least[place, number])
+        if place not in taken and number in free:
+            one, design = listed[number], placements[place].design_from_model
+            heappush(pairs, (off_by(model, some, one.scene_from_model, design), int(place), one.id, int(number)))
+    settle(np.inf)
     return taken
 
 
