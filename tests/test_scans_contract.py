@@ -175,6 +175,8 @@ def test_every_format_is_tried() -> None:
 def test_wrong_names_get_a_helpful_line(tmp_path: Path) -> None:
     with pytest.raises(UnreadableFileError, match="no such file"):
         read_scan(tmp_path / "missing.e57")
+    with pytest.raises(UnreadableFileError, match="missing: no such file or folder"):
+        read_scan(tmp_path / "missing")
     with pytest.raises(UnreadableFileError, match="is a folder"):
         read_scan(tmp_path)
     (tmp_path / "scan.e75").touch()

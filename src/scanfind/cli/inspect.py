@@ -54,7 +54,7 @@ def inspect(
 
         scanfind inspect shop.e57 --design steel.ifc --allowed 0.01 --out inspected
         scanfind inspect shop.e57 --design steel.ifc --allowed structural-steel --upright
-        scanfind inspect setups/ --design steel.ifc --memory 3GB --out inspected-site
+        scanfind inspect shop.e57 --design steel.ifc --memory 3GB --out elements
 
     Parameters
     ----------

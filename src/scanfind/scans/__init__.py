@@ -164,6 +164,9 @@ def _reader(path: Path) -> ModuleType:
     if path.is_dir():
         msg = f"{path} is a folder: give the scan files in it, for example {path}/*.e57"
         raise UnreadableFileError(msg)
+    if not suffix and not path.exists():  # a folder most likely
+        msg = f"{path}: no such file or folder"
+        raise UnreadableFileError(msg)
     if suffix not in SCAN_READERS:
         near = difflib.get_close_matches(suffix, SCAN_READERS, n=1, cutoff=0.5)
         hint = f" (did you mean {near[0]}?)" if near else ""
