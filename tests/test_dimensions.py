@@ -303,15 +303,12 @@ def some_points(count: int) -> PointChunk:
 def test_cutting_farther_out_leaves_a_detections_own_points_as_they_are() -> None:
     bar = hollow_section(0.1, 0.1, 1.0)
     near, chunk = near_triangles(bar.triangles(), 0.02), some_points(20_000)
-    rests: list[list[PointChunk]] = [[], []]
     placed = [Placed(1, near, Pose.identity())]
-    narrow = isolate([chunk], placed, IsolateParameters(0.005), remainder=rests[0].append)[1]
-    wide = isolate([chunk], placed, IsolateParameters(0.02), remainder=rests[1].append, own=0.005)[1]
+    narrow, wide = (isolate([chunk], placed, IsolateParameters(reach))[1] for reach in (0.005, 0.02))
     assert len(wide) > len(narrow)
     own = nearer(wide, 0.005)
     assert np.array_equal(own.source_index, narrow.source_index)
     assert np.array_equal(own.deviation, narrow.deviation)
-    assert np.array_equal(rests[0][0].source_index, rests[1][0].source_index)
 
 
 def test_dimensions_come_back_from_results_as_they_were() -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scanfind.cloud import OrientedCloud, PointChunk
 from scanfind.detection import IsolatedPoints
 from scanfind.errors import InvalidGeometryError, UsageError
-from scanfind.isolation.isolate import IsolateParameters, Isolator, Placed, isolate
+from scanfind.isolation.isolate import IsolateParameters, Isolator, Placed, isolate, left_over
 from scanfind.library.near_surface import near_samples, near_triangles, signed_distances
 from scanfind.pose import Pose
 
@@ -111,8 +111,8 @@ def test_the_nearest_surface_within_tolerance_has_the_point(seed: int, count: in
 
 def test_each_point_has_one_owner_or_remains(crowd: tuple[list[Placed], PointChunk]) -> None:
     placed, chunk = crowd
-    rest: list[PointChunk] = []
-    found = isolate([chunk], placed, PARAMETERS, remainder=rest.append)
+    found = isolate([chunk], placed, PARAMETERS)
+    rest = list(left_over([chunk], found.values()))
     index = np.concatenate([*(f.source_index for f in found.values()), rest[0].source_index])
     np.testing.assert_array_equal(np.sort(index), chunk.source_index)
     assert all(len(f) for f in found.values())
@@ -133,11 +133,10 @@ def test_chunks_do_not_matter(ends: list[int]) -> None:
     rng = np.random.default_rng(12)
     placed = [Placed(k + 1, TUBE, pose) for k, pose in enumerate(poses(2, rng))]
     chunk = scene(placed, rng)
-    rest: list[PointChunk] = []
-    rests: list[PointChunk] = []
-    whole = isolate([chunk], placed, PARAMETERS, remainder=rest.append)
-    parts = isolate(cut_at(chunk, ends), placed, PARAMETERS, remainder=rests.append)
+    whole = isolate([chunk], placed, PARAMETERS)
+    parts = isolate(cut_at(chunk, ends), placed, PARAMETERS)
     assert_same(whole, parts)
+    rest, rests = (list(left_over(chunks, whole.values())) for chunks in ([chunk], cut_at(chunk, ends)))
     np.testing.assert_array_equal(np.concatenate([r.xyz for r in rests]), rest[0].xyz)
 
 

@@ -39,9 +39,8 @@ WHY = {
         "lines on the scene's as it has there."
     ),
     "every density and clutter row found": (
-        "Isolated is what lies within four times the noise, 12 mm here, of the placed surface. Where a member "
-        "lies on the floor or on a trestle, some of those points are its neighbour's: one in fourteen where "
-        "the frame itself has 200."
+        "Isolated is what lies within four times the spread of its own points, 7 mm here, of the placed surface. "
+        "Where a member lies on the floor or on a trestle, some of those points are its neighbour's."
     ),
     "RMS by the paper's definition": (
         "It measures to the nearest of the model's 10,000 points, and at the true pose these are so far away."

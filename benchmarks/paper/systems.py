@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from benchmarks.paper.scenes import Cloud
     from scanfind.kernels.distance import NearSurface
 
-# Within how much of the placed model a rival's points are cut: scanfind's own rule, four times the scan's noise.
+# Within how much of the placed model a rival's points are cut: four times the scanner's noise along a beam.
 RIVAL_TOLERANCE_M = 0.012
 RIVAL_LIMIT_S = 60.0
 OURS = {"scanfind": PRESETS["default"], "sharif2017": PRESETS["sharif2017"]}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +14,7 @@ from scanfind.library import ModelLibrary
 from scanfind.results import MODELS, fill_folder, open_remainder, read_results, result_folder, schema
 from scanfind.results.document import findings_of
 from scanfind.scans.sources import Sources
-from scanfind.second_pass import plans_of, surfaces_of, with_dimensions, with_points
+from scanfind.second_pass import plans_of, surfaces_of, with_dimensions, with_points, within, write_left_over
 from scanfind.threads import available_cores
 from scanfind.tolerances import judge_findings, profile_in
 
@@ -44,27 +43,31 @@ def isolate_again(
     Raises UnreadableFileError for no result or a scan that cannot be read, UsageError for no tolerance, OutputError.
     """
     before = read_results(result_dir)
-    within = before.tolerance_m if tolerance is None else tolerance
-    if within is None:
+    widest = before.tolerance_m if tolerance is None else tolerance
+    if widest is None:
         msg = f"{result_dir}: its points were never isolated: give a tolerance, such as --tolerance 0.01 (metres)"
         raise UsageError(msg)
     found, sources, clock = findings_of(before), Sources(list(scans)), Clock()
     if found.scan_scale:
         sources.in_metres(found.scan_scale.metres)
+    tell = progress or (lambda stage, done, total: None)
     with (
         result_folder(result_dir if out is None else out, overwrite=overwrite or out is None) as folder,
         ModelLibrary.open(Path(result_dir) / MODELS) if found or found.elements else ModelLibrary.in_memory() as models,
-        open_remainder(folder / before.remainder, scans) if before.remainder else nullcontext() as rest,
     ):
         with clock("isolate"):
-            tell = progress or (lambda stage, done, total: None)
             say_if_compiling(tell)
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
             # Of the whole model as designed, also where the search fitted its parts one by one.
-            surfaces = surfaces_of(found, models.models(), within)
+            surfaces = surfaces_of(found, models.models(), widest)
             plans = plans_of(found, models.models()) if before.measured() else {}
-            reach = max([within, *(plan.reach for plan in plans.values())])
-            cut, around = with_points(found, surfaces, {}, chunks, within, rest, available_cores(), reach)
+            reach = max([widest, *(plan.reach for plan in plans.values())])
+            _, around = with_points(found, surfaces, {}, chunks, widest, available_cores(), reach)
+            cut = [within(one, around[one.id], tolerance or one.tolerance_m or widest) for one in found]
+        if before.remainder:
+            with clock("isolate"), open_remainder(folder / before.remainder, scans) as rest:
+                chunks = watched(sources.chunks(), clock, tell, "remainder", sources.expected())
+                write_left_over(rest, chunks, cut)
         # Where the scanner stood may have been told to the search by hand.
         stood = {scan.path: scan.stations for scan in found.scans}
         scanned = [source.told() for source in sources.all]
@@ -78,7 +81,7 @@ def isolate_again(
         findings.refused, findings.notes = found.refused, found.notes
         findings.elements, findings.alignment = found.elements, found.alignment
         findings.scan_scale = found.scan_scale
-        findings.shift, findings.crs, findings.tolerance_m = found.shift, found.crs, within
+        findings.shift, findings.crs, findings.tolerance_m = found.shift, found.crs, widest
         findings.scans = seen
         if profile := profile_in(before):
             judge_findings(findings, profile, models)

@@ -166,6 +166,7 @@ class Detection:
     rival : the best score among poses of the same surface that were refused in its favour; NaN where there is none
     probability : that it is right, by how often simulated poses of such a score were (see `evidence.confidence`); NaN
         where nobody measured, and in results of a version that did not know
+    tolerance_m : how far from the placed model its own points may lie, metres; None where none were isolated
     """
 
     id: int
@@ -189,6 +190,7 @@ class Detection:
     instead_of: str = ""
     rival: float = nan
     probability: float = nan
+    tolerance_m: float | None = None
 
     @property
     def sigma_m(self) -> float:
@@ -250,7 +252,8 @@ class ScanScale(NamedTuple):
 class Findings(list[Detection]):
     """The detections, best first, with what a report needs around them.
 
-    tolerance_m : within which raw points were isolated, metres; None where they were not
+    tolerance_m : no point farther from a placed model than this was isolated, metres; None where none were. Each
+        detection has its own, see there
     elements : of the design, what became of each; empty where that was not asked for
     profile : how far elements may be off; None: nobody says
     missing : scans that could not be read and were left out, and why

@@ -20,12 +20,14 @@ from scanfind.recognition.sizes import Sizes
 from scanfind.scale import in_metres, scan_scale
 from scanfind.scans.sources import Scan, Sources, require_points
 from scanfind.second_pass import (
-    isolation_tolerance,
+    isolation_gate,
     near_parts,
     plans_of,
     surfaces_of,
     with_dimensions,
+    with_own_points,
     with_points,
+    write_left_over,
 )
 from scanfind.sought import ModelInput, models_of
 from scanfind.threads import available_cores
@@ -115,23 +117,29 @@ def find(
         with clock("isolate"):  # each part by its own raw points, in a pass of its own: where they are decides 3.5
             beside = near_parts(parts, watched(sources.chunks(), clock, tell, "isolate", sources.expected()), jobs)
             findings[:] = [found.measured(one, beside.get(one.id)) for one in findings]
-    if isolate and (findings or remainder is not None):
+    if isolate and findings:
         with clock("isolate"):  # 3.5 isolation: the second pass
             chunks = watched(sources.chunks(), clock, tell, "isolate", sources.expected())
-            tolerance = isolation_tolerance(parameters.isolate, found.noise(), found.cell())
+            tolerance = isolation_gate(parameters.isolate, found.noise(), found.cell())
             findings.tolerance_m = tolerance
             surfaces = surfaces_of(findings, library, tolerance)
             plans = plans_of(findings, library) if parameters.isolate.dimensions else {}
             built, reach = found.built(), max([tolerance, *(plan.reach for plan in plans.values())])
-            findings[:], around = with_points(findings, surfaces, built, chunks, tolerance, remainder, jobs, reach)
+            findings[:], around = with_points(findings, surfaces, built, chunks, tolerance, jobs, reach)
         with clock("refine"):  # 3.4 once more, on the raw points: the exact surface, and how uncertain the pose is
             # Parts were fitted to the raw points before.
             findings[:] = [
                 one if one.parts else polished(one, surfaces[one.model], parameters.refine, jobs) for one in findings
             ]
+            finest = found.finest_cell()
+            findings[:] = [with_own_points(one, parameters.isolate, tolerance, finest) for one in findings]
         with clock("measure"):  # what a drawing would dimension, as built
             places = [place for source in sources.all for place in source.told().stations]
             findings[:] = with_dimensions(findings, plans, surfaces, around, places, reach, built)
+    if remainder is not None:
+        with clock("isolate"):
+            chunks = watched(sources.chunks(), clock, tell, "remainder", sources.expected())
+            write_left_over(remainder, chunks, findings)
     findings.scans = [source.told() for source in sources.all]
     with clock("verify"):
         stations = findings.stations()

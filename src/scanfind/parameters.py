@@ -19,8 +19,9 @@ from scanfind.search.surface import SearchParameters
 class IsolationParameters:
     """Which raw points belong to a detection.
 
-    tolerance_m : those within this distance of the placed model's surface; None: `noises` times the scan's own noise
-        around the detection, at least a tenth and at most half of the grid's cell
+    tolerance_m : those within this distance of the placed model's surface; None: each detection's own
+    noises : that is so many times what its points spread about it (1.48 times the median of their distances), at least
+        a tenth of the grid's finest cell and at most half of that it was found with
     dimensions : measure what a drawing would dimension; a second a model, and a tenth of one a detection
     """
 

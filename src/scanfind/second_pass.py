@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from scanfind.assembly import REACH_M
 from scanfind.dimensions import Plan, dimensioned, plan_of
 from scanfind.isolation.deviation import deviation_of
-from scanfind.isolation.isolate import IsolateParameters, Placed, nearer
+from scanfind.isolation.isolate import IsolateParameters, Placed, left_over, nearer
 from scanfind.isolation.isolate import isolate as isolate_raw
 from scanfind.library.near_surface import near_model, near_triangles
 from scanfind.pose import Pose
@@ -27,11 +28,39 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 
-def isolation_tolerance(parameters: IsolationParameters, noise: float, cell: float) -> float:
-    """Within how many metres of a placed surface a raw point belongs to it."""
+# Twice what the grid takes for noise: it is a fifth too small where points are many, and cut off there their own spread
+# looks smaller still. Where they are few, cells are large, and what bends within them looks like noise: 15 times it.
+GATE = 2.0
+LEAST_CELLS = 0.1  # of the finest cell: points without noise are rounded, and their pose is off by some of that
+
+
+def isolation_gate(parameters: IsolationParameters, noise: float, cell: float) -> float:
+    """Within how many metres of a placed surface a raw point may belong to it, by the noise that the grid tells."""
     if parameters.tolerance_m is not None:
         return parameters.tolerance_m
-    return min(max(parameters.noises * noise, 0.1 * cell), 0.5 * cell)
+    return min(max(GATE * parameters.noises * noise, LEAST_CELLS * cell), 0.5 * cell)
+
+
+def with_own_points(found: Detection, parameters: IsolationParameters, gate: float, finest_cell: float) -> Detection:
+    """Of the points within the gate of a detection those that are its own: what spreads about it as most of them do.
+
+    found : fitted to these points; gate, finest_cell : metres
+    """
+    points = found.isolated
+    if points is None or not len(points) or parameters.tolerance_m is not None:
+        return replace(found, tolerance_m=None if points is None else gate)
+    # The median: up to half of the points may be those of a floor or a neighbour.
+    spread = 1.4826 * float(np.median(np.abs(points.deviation)))
+    tolerance = min(max(parameters.noises * spread, LEAST_CELLS * finest_cell), gate)
+    return within(found, points, tolerance)
+
+
+def within(found: Detection, points: IsolatedPoints, tolerance: float) -> Detection:
+    """A detection with those of some points that are no farther from it than a tolerance, metres."""
+    own = nearer(points, tolerance)
+    return replace(
+        found, isolated=own, deviation=deviation_of(own.deviation) if len(own) else None, tolerance_m=tolerance
+    )
 
 
 def surfaces_of(findings: Sequence[Detection], library: Sequence[Model], tolerance: float) -> dict[str, NearSurface]:
@@ -49,9 +78,9 @@ def plans_of(findings: Sequence[Detection], library: Sequence[Model]) -> dict[st
 
 def with_points(
     findings: Sequence[Detection], surfaces: Mapping[str, NearSurface], built: Mapping[int, Floats],
-    chunks: Iterable[PointChunk], tolerance: float, remainder: CloudWriter | None, jobs: int, reach: float,
+    chunks: Iterable[PointChunk], tolerance: float, jobs: int, reach: float,
 ) -> tuple[list[Detection], dict[int, IsolatedPoints]]:  # fmt: skip
-    """Each detection with its raw points and how far they are from its model; by id, all points within `reach`.
+    """Each detection with the raw points within `tolerance` and how far they are; by id, all points within `reach`.
 
     built : by id, the faces (F, 3, 3), scan frame, of those fitted in parts: what their points are cut and measured by
     """
@@ -61,13 +90,8 @@ def with_points(
         else Placed(found.id, surfaces[found.model]._replace(reach=reach), found.scene_from_model)
         for found in findings
     ]
-    rest = None if remainder is None else lambda chunk: write_rest(remainder, chunk)
-    points = isolate_raw(chunks, placed, IsolateParameters(reach), remainder=rest, jobs=jobs, own=tolerance)
-    told = [
-        found.with_points(cut := nearer(points[found.id], tolerance), deviation_of(cut.deviation) if len(cut) else None)
-        for found in findings
-    ]
-    return told, points
+    points = isolate_raw(chunks, placed, IsolateParameters(reach), jobs=jobs)
+    return [within(found, points[found.id], tolerance) for found in findings], points
 
 
 def with_dimensions(
@@ -102,8 +126,8 @@ def as_built(number: int, faces: Floats, reach: float) -> Placed:
     return Placed(number, near_triangles(faces - corner, reach), Pose(np.eye(3), corner.copy()))
 
 
-def write_rest(writer: CloudWriter, chunk: PointChunk) -> None:
-    """Points of no detection, with where they came from."""
-    count = len(chunk)
-    scan_id = np.full(count, chunk.scan, np.int32)
-    writer.write(chunk.xyz, {**chunk.attributes, "scan_id": scan_id, "source_index": chunk.source_index})
+def write_left_over(writer: CloudWriter, chunks: Iterable[PointChunk], findings: Iterable[Detection]) -> None:
+    """The points of no detection, with where they came from: a pass of its own, when all others are known."""
+    for rest in left_over(chunks, [one.isolated for one in findings if one.isolated is not None]):
+        scan_id = np.full(len(rest), rest.scan, np.int32)
+        writer.write(rest.xyz, {**rest.attributes, "scan_id": scan_id, "source_index": rest.source_index})

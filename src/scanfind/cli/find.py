@@ -121,7 +121,7 @@ def find(
     min_score
         Refuse what scores less, 0 to 1.
     tolerance
-        Points this near to a found model are its own, metres.
+        Points this near to a found model are its own, metres; unless given, within four times what its own spread.
     parts
         Fit the parts of each model one by one: find what was not built to the drawing, and tell which part is off.
     dimensions

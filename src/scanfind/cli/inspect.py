@@ -85,7 +85,7 @@ def inspect(
     jobs
         Threads; one a core unless given.
     tolerance
-        Points this near to a found element are its own, metres.
+        Points this near to a found element are its own, metres; unless given, within four times what its own spread.
     dimensions
         Measure what a drawing would dimension as well: flange faces, pipes, lengths, squareness.
     time_limit

@@ -6,7 +6,7 @@ surfaces (`Vicinity`); the exact distance is left to the few that remain. Points
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -154,17 +154,12 @@ def isolate(
     placed: Sequence[Placed],
     parameters: IsolateParameters,
     shift: ArrayLike = (0, 0, 0),
-    remainder: Callable[[PointChunk], None] | None = None,
     jobs: int = 1,
-    own: float | None = None,
 ) -> dict[int, IsolatedPoints]:
     """The raw points of every placed model, by detection id, in the order of the stream; empty where there is none.
 
     chunks : all scans of the scene, file frame; `scan` must count on over files, for it becomes scan_id
     shift : (3,) taken off the file's coordinates before the poses hold, metres
-    remainder : receives what is left of each chunk, one for one and possibly empty: the scene without the found objects
-    own : what is farther from a surface than this, metres, is left over too, though it is cut out; None: nothing is
-
     jobs : threads, on which the result does not depend
 
     Every detection has every attribute of the scene; where a chunk lacks one, it is NaN (floats) or 0.
@@ -179,8 +174,6 @@ def isolate(
         owner, deviation = isolator.cut(chunk)
         for key, piece in pieces_of(chunk, owner, deviation):
             pieces[key].append(piece)
-        if remainder is not None:
-            remainder(subset(chunk, (owner == 0) | (np.abs(deviation) > np.float32(np.inf if own is None else own))))
     return {key: joined(mine, fields) for key, mine in pieces.items()}
 
 
@@ -213,6 +206,17 @@ def nearer(points: IsolatedPoints, distance: float) -> IsolatedPoints:
     return IsolatedPoints(
         points.xyz[near], attributes, points.scan_id[near], points.source_index[near], points.deviation[near]
     )
+
+
+def left_over(chunks: Iterable[PointChunk], isolated: Iterable[IsolatedPoints]) -> Iterator[PointChunk]:
+    """What is left of each chunk, one for one and possibly empty: the scene without the points that somebody has."""
+    records: dict[int, list[NDArray[np.int64]]] = {}
+    for points in isolated:
+        for scan in np.unique(points.scan_id).tolist():
+            records.setdefault(scan, []).append(points.source_index[points.scan_id == scan])
+    taken = {scan: np.sort(np.concatenate(some)) for scan, some in records.items()}
+    for chunk in chunks:
+        yield subset(chunk, ~np.isin(chunk.source_index, taken.get(chunk.scan, ())))
 
 
 def subset(chunk: PointChunk, rows: NDArray[Any]) -> PointChunk:

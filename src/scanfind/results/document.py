@@ -187,6 +187,7 @@ def _detection_entry(found: Detection, pose: str | None, isolated: str | None) -
         instead_of=found.instead_of,
         rival=_or_none(found.rival),
         probability=_or_none(found.probability),
+        tolerance_m=found.tolerance_m,
     )
 
 
@@ -340,6 +341,7 @@ def _detection(entry: schema.DetectionEntry) -> Detection:
         instead_of=entry.instead_of,
         rival=_or_nan(entry.rival),
         probability=_or_nan(entry.probability),
+        tolerance_m=entry.tolerance_m,
     )
 
 

@@ -180,7 +180,7 @@ class DetectionEntry(Entry):
     `rival`: the best score among poses of the same surface that were refused in its favour, null where there is none.
     `probability`: that the model is there, at this pose; docs/score.md says what it was measured on. null where nobody
     measured: at a design's place, by parts, of a piece of scan, with weights of one's own; and in results of an earlier
-    version.
+    version. `tolerance_m`: how far from the placed model its isolated points may lie, null where none were isolated.
     """
 
     id: int
@@ -209,6 +209,7 @@ class DetectionEntry(Entry):
     instead_of: str = ""
     rival: float | None = None
     probability: float | None = None
+    tolerance_m: float | None = None
 
 
 class RefusedEntry(Entry):
@@ -292,7 +293,7 @@ class ScaleEntry(Entry):
 class Results(Entry):
     """results.json. `shift_m` was taken off while computing; every coordinate here has it added back.
 
-    `tolerance_m` is within which points were isolated, null where they were not. `elements` are those of the design,
+    `tolerance_m`: no point farther from a model was isolated, null where none were. `elements` are those of the design,
     where a search was asked what became of it; `profile` by how much they may be off, as a TOML file says it (see
     docs/report.md). `allowed_m` says so in results of an earlier version: no point of theirs by more. `made`: when this
     was written, UTC as in 2026-11-22T17:30:00Z, null in results of an earlier version. `alignment`: null where scans

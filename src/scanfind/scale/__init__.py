@@ -34,7 +34,7 @@ from scanfind.recognition.sizes import Sizes
 from scanfind.recognition.weighing import Weighing
 from scanfind.scale.steps import sized, sizes_tried, with_pairs
 from scanfind.search.hypotheses import Hypotheses, model_arrays
-from scanfind.second_pass import isolation_tolerance
+from scanfind.second_pass import isolation_gate
 
 if TYPE_CHECKING:
     from scanfind.clock import Clock
@@ -168,7 +168,7 @@ def weighed(search: Recognition, fits: Sequence[tuple[Model, Similarity]]) -> li
         np.array([fit.pose.translation / fit.scale for _, fit in fits]), np.ones(len(fits)),
     )  # fmt: skip
     found = weighing.candidates(Fitting(ground, weighing).fine(poses))
-    gate = isolation_tolerance(IsolationParameters(), scene.noise, scene.fine.cell)
+    gate = isolation_gate(IsolationParameters(), scene.noise, scene.fine.cell) / RAW_REACH
     return [
         Seen(*fits[one.model], one.area, gate * fits[one.model][1].scale)
         for one in found

@@ -41,7 +41,7 @@ from scanfind.priors.allowed import box_searched, require_points_in
 from scanfind.recognition.sizes import Sizes
 from scanfind.results.document import fingerprint
 from scanfind.scans.sources import Scan
-from scanfind.second_pass import isolation_tolerance
+from scanfind.second_pass import isolation_gate
 from scanfind.sought import ModelInput, models_of
 from scanfind.threads import available_cores
 from scanfind.tiles.listed import Listed, listed_of
@@ -56,7 +56,7 @@ from scanfind.tiles.points import isolate_all, write_remainder
 from scanfind.tiles.search import Searched, cell_of, own
 from scanfind.tiles.stored import parts_of, reached_from, stored_bins
 from scanfind.tiles.sweep import search_all
-from scanfind.tiles.tasks import Found, Job, Summed, count, sum_up
+from scanfind.tiles.tasks import Job, Summed, count, sum_up
 from scanfind.tiles.told import all_told
 from scanfind.tiles.work import Crew, Here, Workers, all_done, no_room, opened
 
@@ -180,13 +180,12 @@ def _find(
 
     with clock("isolate"):
         one = largest or searched[-1]
-        tolerance = isolation_tolerance(parameters.isolate, one.noise, one.cell)
-        placed = [Found(one.id, one.model, one.scene_from_model) for one in findings]
+        tolerance = isolation_gate(parameters.isolate, one.noise, one.cell)
         if isolate and findings:
             findings.tolerance_m = tolerance
-            findings[:] = isolate_all(job, listed, findings, placed, tolerance, summed, crew, clock, tell)
+            findings[:] = isolate_all(job, listed, findings, tolerance, summed, crew, clock, tell)
         if remainder is not None:
-            write_remainder(job, listed, placed, tolerance, summed, remainder, tell)
+            write_remainder(listed, findings, summed, remainder, tell)
     findings.scans, findings.crs = [one.told for one in summed], listed.crs()
     with clock("verify"):
         if at_design or len(findings.stations()) > 1:

@@ -10,27 +10,28 @@ import numpy as np
 from scanfind.dimensions import dimensioned
 from scanfind.fit.polish import polished
 from scanfind.isolation.deviation import deviation_of
-from scanfind.isolation.isolate import subset
-from scanfind.second_pass import write_rest
-from scanfind.tiles.tasks import Cut, cut, gathered, isolator_of, on_disk, plan_in, surface_of
+from scanfind.second_pass import with_own_points, write_left_over
+from scanfind.tiles.tasks import Cut, Found, cut, gathered, on_disk, plan_in, surface_of
 from scanfind.tiles.work import Crew, all_done, no_room
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from scanfind.clock import Clock
+    from scanfind.cloud import PointChunk
     from scanfind.detection import Detection, Findings
     from scanfind.progress import Progress
     from scanfind.scans import CloudWriter
     from scanfind.tiles.listed import Listed
-    from scanfind.tiles.tasks import Found, Job, Summed
+    from scanfind.tiles.tasks import Job, Summed
 
 
 def isolate_all(
-    job: Job, listed: Listed, findings: Findings, found: Sequence[Found], tolerance: float, summed: list[Summed],
-    crew: Crew, clock: Clock, tell: Progress,
+    job: Job, listed: Listed, findings: Findings, tolerance: float, summed: list[Summed], crew: Crew, clock: Clock,
+    tell: Progress,
 ) -> list[Detection]:  # fmt: skip
     """Every detection with its raw points, on disk, and fitted to them."""
+    found = [Found(one.id, one.model, one.scene_from_model) for one in findings]
     tasks = {
         f"cut-{k:05d}": (cut, job, listed.all[k].scan, k, found, tolerance, first) for k, first in readable(summed)
     }
@@ -50,11 +51,13 @@ def isolate_all(
         with clock("refine"):
             surface = surface_of(job.folder, one.model, tolerance)
             fitted = polished(with_points, surface, job.parameters.refine, job.jobs)
-        if job.parameters.isolate.dimensions and fitted.isolated is not None:
+            around = fitted.isolated
+            fitted = with_own_points(fitted, job.parameters.isolate, tolerance, job.cell)
+        if job.parameters.isolate.dimensions and around is not None:
             with clock("measure"):
                 plan = plan_in(job.folder, one.model)
                 if plan is not None:
-                    fitted = dimensioned(fitted, plan, surface, fitted.isolated, stations, tolerance, jobs=job.jobs)
+                    fitted = dimensioned(fitted, plan, surface, around, stations, tolerance, jobs=job.jobs)
         points = fitted.isolated or cut_out
         try:
             measured.append(replace(fitted, isolated=on_disk(points, job.folder / f"points-{one.id:05d}")))
@@ -64,18 +67,20 @@ def isolate_all(
 
 
 def write_remainder(
-    job: Job, listed: Listed, found: Sequence[Found], tolerance: float, summed: list[Summed], remainder: CloudWriter,
-    tell: Progress,
-) -> None:  # fmt: skip
+    listed: Listed, findings: Findings, summed: list[Summed], remainder: CloudWriter, tell: Progress
+) -> None:
     """Every point that belongs to no detection, in the order of the scans: one file is written by one process."""
-    isolator = isolator_of(job, found, tolerance)
-    done, expected = 0, sum(one.told.points for one in summed)
-    for k, first in readable(summed):
-        for chunk in listed.all[k].opened(listed.origin).chunks(first):
-            owner, _ = isolator.cut(chunk)
-            write_rest(remainder, subset(chunk, owner == 0))
-            done += len(chunk)
-            tell("remainder", done, expected)
+    expected = sum(one.told.points for one in summed)
+
+    def chunks() -> Iterator[PointChunk]:
+        done = 0
+        for k, first in readable(summed):
+            for chunk in listed.all[k].opened(listed.origin).chunks(first):
+                yield chunk
+                done += len(chunk)
+                tell("remainder", done, expected)
+
+    write_left_over(remainder, chunks(), findings)
 
 
 def readable(summed: Sequence[Summed]) -> list[tuple[int, int]]:

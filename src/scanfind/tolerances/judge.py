@@ -276,7 +276,7 @@ def _held(each: ElementEntry, found: DetectionEntry, model: ModelEntry | None) -
 def _surface(results: Results, found: DetectionEntry) -> dict[str, Measured | str]:
     """How far its own points lie from its surface, or why that says nothing."""
     keys = ("surface_p95_mm", "surface_mean_mm")
-    deviation, within = found.deviation, results.tolerance_m
+    deviation, within = found.deviation, found.tolerance_m or results.tolerance_m
     if deviation is None or deviation.p95_m is None or deviation.mean_m is None or within is None:
         return dict.fromkeys(keys, "it has no points of its own")
     if found.points < LEAST_POINTS:
