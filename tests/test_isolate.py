@@ -14,11 +14,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from scanfind.cloud import OrientedCloud, PointChunk
-from scanfind.detection import IsolatedPoints
+from scanfind.detection import Detection, IsolatedPoints
 from scanfind.errors import InvalidGeometryError, UsageError
 from scanfind.isolation.isolate import IsolateParameters, Isolator, Placed, isolate, left_over
 from scanfind.library.near_surface import near_samples, near_triangles, signed_distances
+from scanfind.parameters import IsolationParameters
 from scanfind.pose import Pose
+from scanfind.second_pass import with_own_points
 
 Floats = NDArray[np.float64]
 
@@ -262,3 +264,33 @@ def test_the_door() -> None:
     for tolerance, cell in ((0.0, 0.04), (np.nan, 0.04), (0.02, -1.0)):
         with pytest.raises(UsageError, match="positive"):
             IsolateParameters(tolerance, cell)
+
+
+def around(off: Floats) -> Detection:
+    """A detection with points so far from it, (N,) metres."""
+    nobody = np.zeros(len(off), np.int32)
+    points = IsolatedPoints(np.zeros((len(off), 3)), {}, nobody, np.arange(len(off)), off.astype(np.float32))
+    return Detection(1, "tube", Pose.identity(), 1.0, 1.0, 1.0, 0.0, 1.0, 0.0, isolated=points)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(0.0005, 0.004), st.floats(0.0, 0.3), st.integers(0, 99))
+def test_own_points_lie_as_near_as_most_of_them_do(noise: float, neighbours: float, seed: int) -> None:
+    """Four of their own sigmas, whatever the grid took for noise, and though others' points lie about."""
+    rng, gate = np.random.default_rng(seed), 0.05
+    own = rng.normal(scale=noise, size=1000)
+    others = rng.uniform(-gate, gate, int(1000 * neighbours))
+    kept = with_own_points(around(np.concatenate([own, others])), IsolationParameters(), gate, 0.002)
+    assert kept.tolerance_m is not None
+    assert kept.isolated is not None
+    assert 3.5 * noise < kept.tolerance_m < 7.0 * noise
+    assert np.abs(kept.isolated.deviation).max() <= np.float32(kept.tolerance_m)
+    assert (kept.isolated.source_index < len(own)).sum() >= 0.99 * len(own)
+
+
+def test_own_points_never_lie_beyond_the_gate_nor_within_a_rounding() -> None:
+    wide = np.linspace(-0.05, 0.05, 101)
+    assert with_own_points(around(wide), IsolationParameters(), 0.05, 0.002).tolerance_m == 0.05
+    assert with_own_points(around(0.0 * wide), IsolationParameters(), 0.05, 0.002).tolerance_m == 0.1 * 0.002
+    given = with_own_points(around(wide), IsolationParameters(tolerance_m=0.05), 0.05, 0.002)
+    assert (given.tolerance_m, len(given.isolated or ())) == (0.05, 101)
