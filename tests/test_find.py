@@ -13,11 +13,13 @@ import pytest
 from numpy.typing import NDArray
 
 import scanfind.scans.sources
+from scanfind.clock import Clock
 from scanfind.cloud import PointCloud
 from scanfind.detection import Findings
 from scanfind.errors import InvalidGeometryError, ScanfindError, UnreadableFileError, UsageError
 from scanfind.evidence.confidence import CURVES, SEEN
-from scanfind.find import find
+from scanfind.find import begin, find
+from scanfind.grid.moments import MomentGrid
 from scanfind.grid.scene import GridParameters
 from scanfind.library import ModelLibrary
 from scanfind.library.model import ModelParameters
@@ -26,6 +28,8 @@ from scanfind.library.surface import SurfaceParameters
 from scanfind.mesh import Mesh
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.pose import Pose, random_rotation
+from scanfind.recognition.sizes import Sizes
+from scanfind.scans.sources import Sources
 from scanfind.simulate.furniture import hall
 from scanfind.simulate.objects import pipe_spool
 from scanfind.simulate.parts import blocks, box, cylinder
@@ -207,6 +211,21 @@ def test_two_are_found_as_two(two: Findings) -> None:
     ]
     assert len(owners) == 2
     assert not owners[0] & owners[1]
+
+
+def test_parts_that_are_alike_have_their_hypotheses_each() -> None:
+    """What leads to one of two like parts leads to the other too: noise does not choose between them before a fit."""
+    (bracket,) = library().models()
+    sizes = Sizes([bracket, replace(bracket, name="twin")], QUICK)
+    grid = MomentGrid(sizes.finest_cell())
+    for chunk in Sources(clouds(), None).chunks():
+        grid.add(chunk)
+    grid.release()
+    drawn = begin(next(iter(sizes.groups())), grid, [], QUICK, 0, 1, Clock()).round()
+    one, other = (drawn.take(np.flatnonzero(drawn.models == number)) for number in (0, 1))
+    assert len(one.models) > 10
+    np.testing.assert_array_equal(one.rotations, other.rotations)
+    np.testing.assert_array_equal(one.translations, other.translations)
 
 
 def test_one_is_found_once() -> None:

@@ -232,19 +232,26 @@ def test_pairs(
     start, stop, pair_first, pair_second, pair_signs, pair_keys, means, normals,
     offsets, entry_model, entry_first, entry_second, model_starts, model_points, model_normals, samples,
     length, cell, hash_keys, hash_values, occupied, masks, least_hits, origins, allowed,
-    best_support, best_model, best_rotation, best_translation,
 ):  # fmt: skip
-    """Test every hypothesis of scene pairs start … stop; keep the best of each pair.
+    """Test every hypothesis of scene pairs start … stop; returns the best of each pair of each model that pass.
 
-    offsets, entry_* : the library's hash table in CSR form; entry_first, entry_second : samples of entry_model
+    Of each model: parts that are nearly alike lie on the scene as well as one another, but for noise.
+
+    offsets, entry_* : the library's hash table in CSR form, those of a cell model by model; entry_first,
+        entry_second : samples of entry_model
     model_starts : (models+1,) where each model's samples begin in model_points, model_normals
     samples : (N, 6) float32, the same points and normals side by side, for the test
     length : metres, of the normals in the four-point sets; 0 for the limit (see pair_pose)
     least_hits : (T+1,) Wald's test as a table: after k points fewer hits than least_hits[k] end it
     origins : (K, 3) scanner positions: samples that face none of them are passed over; none: all are tested
     allowed : which poses are worth a test
-    best_support : out, share of hits among the samples tested; 0 where no hypothesis passed
+
+    Returns H of them in the order of the pairs: support (H,), the share of hits among the samples tested; model (H,);
+    rotation (H, 3, 3); translation (H, 3).
     """
+    best_support, best_model = np.empty(64), np.empty(64, np.int64)
+    best_rotation, best_translation = np.empty((64, 3, 3)), np.empty((64, 3))
+    count = 0
     inverse = 1.0 / cell
     scene, model = np.empty((4, 4)), np.empty((4, 4))
     rotation, translation = np.empty((3, 3)), np.empty(3)
@@ -252,7 +259,7 @@ def test_pairs(
     s1, b1, s2, b2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     last = least_hits.shape[0] - 1
     for k in range(start, stop):
-        best_support[k] = 0.0
+        so_far, best = -1, 0.0
         fetch(means, normals, pair_first[k], 1.0 - 2.0 * (pair_signs[k] & 1), s1, b1)
         fetch(means, normals, pair_second[k], 1.0 - (pair_signs[k] & 2), s2, b2)
         frame_of_pair(s1, b1, s2, b2, scene)
@@ -285,10 +292,23 @@ def test_pairs(
                     break
             if tested == 0 or hits < least_hits[last] * tested / last:
                 continue
-            if hits / tested > best_support[k]:
-                best_support[k] = hits / tested
-                best_model[k] = which
-                for r in range(3):
-                    best_translation[k, r] = translation[r]
-                    for c in range(3):
-                        best_rotation[k, r, c] = rotation[r, c]
+            if which == so_far and hits / tested <= best:
+                continue
+            if which != so_far:
+                if count == len(best_support):
+                    best_support, best_model = doubled(best_support), doubled(best_model)
+                    best_rotation, best_translation = doubled(best_rotation), doubled(best_translation)
+                count += 1
+            so_far, best = which, hits / tested
+            best_support[count - 1], best_model[count - 1] = best, which
+            for r in range(3):
+                best_translation[count - 1, r] = translation[r]
+                for c in range(3):
+                    best_rotation[count - 1, r, c] = rotation[r, c]
+    return best_support[:count], best_model[:count], best_rotation[:count], best_translation[:count]
+
+
+@kernel
+def doubled(rows):
+    """The same rows with as much room again."""
+    return np.concatenate((rows, np.empty_like(rows)))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scanfind.grid.moments import empty_hash
 from scanfind.library.pairs import rung_distance
-from scanfind.search.hypotheses import Hypotheses
+from scanfind.search.hypotheses import Hypotheses, no_hypotheses
 from scanfind.threads import in_threads
 
 if TYPE_CHECKING:
@@ -137,23 +137,23 @@ class Trial(NamedTuple):
     allowed: Allowed
 
     def test(self, pairs: Pairs, of: OrientedCloud, jobs: int) -> Hypotheses:
-        """The best hypothesis of each pair that passes, best first; of : the points the pairs are of."""
+        """The best hypothesis of each pair of each model that pass, best first; of : the points the pairs are of."""
         from scanfind.kernels.search import test_pairs
 
-        count = len(pairs.first)
-        support, models = np.zeros(count), np.zeros(count, np.int64)
-        rotations, translations = np.empty((count, 3, 3)), np.empty((count, 3))
         table, arrays, marks = self.table, self.arrays, self.marks
-        in_threads(
-            jobs, count,
+        passed = in_threads(
+            jobs, len(pairs.first),
             lambda start, stop: test_pairs(
                 start, stop, *pairs, of.points, of.normals, table.offsets, table.model, table.first, table.second,
                 arrays.starts, arrays.points, arrays.normals, arrays.samples, self.normal_length, marks.cell,
                 marks.hash_keys, marks.hash_values, marks.occupied, marks.masks, self.least_hits, self.origins,
-                self.allowed, support, models, rotations, translations,
+                self.allowed,
             ),
         )  # fmt: skip
-        order = np.argsort(-support, kind="stable")[: np.count_nonzero(support)]
+        if not passed:
+            return no_hypotheses()
+        support, models, rotations, translations = (np.concatenate(column) for column in zip(*passed, strict=True))
+        order = np.argsort(-support, kind="stable")
         return Hypotheses(models[order], rotations[order], translations[order], support[order])
 
 

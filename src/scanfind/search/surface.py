@@ -35,6 +35,10 @@ ROUNDS_A_POOL = 4  # draw from mostly the same cells, which are fitted then; sma
 # The first round tells how easily an instance is found, and often finds all there is. Rounds after it: a little more
 # than is missing, and enough to be worth refining; rather a little more in one round than two.
 FIRST_ROUND, ROUND_MARGIN, LEAST_ROUND, MOST_ROUND = 0.3, 1.1, 0.15, 1.3
+# A round can afford so many models: of more, each has its share. With 200,000 hypotheses for 40 spools only pairs were
+# tested whose feature was drawn once or twice, which is mostly noise: of a spool found alone in its first round not one
+# right hypothesis in five rounds.
+MODELS_A_ROUND = 10
 # With so many scanner positions nearly every sample faces one, and asking costs more than it tells.
 FACING_ORIGINS = 6
 # Of the samples that show, so many lie on the scene under a right hypothesis: noise turns normals and moves it. Asked
@@ -68,7 +72,8 @@ class SearchParameters:
     miss_probability : stop when an instance that shows `overlap_ratio` of its surface has been missed with less than
         this chance; 0: use all of the time limit, as the paper does
     max_instances : stop after so many detections; None: all there are
-    pairs_a_round, hypotheses_a_round : scene pairs drawn before any is tested; hypotheses tested before any is refined
+    pairs_a_round, hypotheses_a_round : scene pairs drawn before any is tested; hypotheses tested before any is refined,
+        of up to ten models; of more, as many more
     by_shape : draw points by the likelihood ratio of their local shape: how bent the surface around them is, on the
         model as against in the scene; walls and floors are most of a scan and little of a spool
     telling_first : test pairs first whose feature is rare in this scene: the chance of a pair to be right, over the
@@ -287,7 +292,7 @@ class Search:
         return np.asarray(LEARNT * self._learned[:, 0] / np.maximum(self._learned[:, 1], 1e-300))
 
     def round(self) -> Hypotheses:
-        """One round: draw pairs, look them up, test their hypotheses; the best of each pair that pass, best first."""
+        """One round: draw pairs, look them up, test their hypotheses; the best of each pair and model, best first."""
         if self._stale:
             self._fill_pool()
         if len(self.pool) < 2:
@@ -296,7 +301,7 @@ class Search:
         count = round(share * limits.pairs_a_round / len(self.rungs))
         drawn = self._draws.draw(count, self.seed, self.rounds, limits.max_tries)
         # Three of four choices of sides are wrong: as many more hypotheses are tested for the same right pairs.
-        most = share * limits.hypotheses_a_round * self._draws.sides
+        most = share * limits.hypotheses_a_round * self._draws.sides * max(1.0, len(self.models) / MODELS_A_ROUND)
         tested = affordable(drawn, self.table, most, rarest_first=limits.telling_first)
         self._expect(count, drawn.keys, tested.keys)
         trial = Trial(
