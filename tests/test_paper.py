@@ -426,7 +426,17 @@ def test_a_rival_counts_where_it_succeeds_as_often() -> None:
     lucky = [replace(row, system="lucky", total_s=0.3, error_mm=2.0, success=int(row.seed == 0)) for row in ours]
     ours = [replace(row, error_mm=1.0) for row in ours]
     told = {one.what: one for one in claims(Results({"scanfind": ours, "slow": slow, "lucky": lucky}, {}))}
-    assert told["time against rivals"].measured.startswith("20.0 × (slow")
+    assert told["time against rivals"].measured == "20.0 × (slow, BF density 5); in the median of those rows (1) 20.0 ×"
     assert told["time against rivals"].held
     # The lucky one's pose errors are those of the scene it found.
     assert not told["pose error"].held
+
+
+def test_a_rival_counts_in_the_scenes_it_was_given_and_where_anything_is_found() -> None:
+    ours = [replace(row, total_s=1.0 + row.seed, error_mm=1.0) for row in rows_with([0, 1, 1, 1], "5", 1.0)]
+    once = [replace(row, system="once", total_s=20.0) for row in ours if row.seed == 1]
+    quick = [replace(row, system="quick", total_s=0.1, success=0) for row in ours if row.seed == 0]
+    (told,) = (c for c in claims(Results({"scanfind": ours, "once": once}, {})) if c.what == "time against rivals")
+    assert told.measured == "10.0 × (once, BF density 5); in the median of those rows (1) 10.0 ×"
+    (told,) = (c for c in claims(Results({"scanfind": ours, "quick": quick}, {})) if c.what == "time against rivals")
+    assert told.held

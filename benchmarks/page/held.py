@@ -120,19 +120,28 @@ def seconds(results: Results) -> Claim:
 
 
 def faster(results: Results) -> Claim:
-    """Against the fastest rival that succeeds as often, row by row."""
+    """Against the fastest rival that finds it as often in the same scenes, row by row."""
     what, words = "time against rivals", f"≥ {TIMES_FASTER:g} × faster than the fastest rival that succeeds as often"
     times = []
     for group in groups(results):
-        ours = middle(group, lambda row: row.total_s)
+        as_often = []
         for system in rivals(results):
             theirs = results.of(system, group[0].experiment, group[0].target, group[0].row)
-            if theirs and success(theirs) >= success(group):
-                times.append((middle(theirs, lambda row: row.total_s) / ours, system, name(group)))
+            seeds = {row.seed for row in theirs}
+            mine = [row for row in group if row.seed in seeds]
+            if mine and success(theirs) >= success(mine) > 0.0:
+                as_often.append((_seconds(theirs) / _seconds(mine), system, name(group)))
+        times += [min(as_often)] if as_often else []
     if not times:
         return Claim(what, words, "no rival measured succeeds as often in any row", True if rivals(results) else None)
     least_, system, row = min(times)
-    return Claim(what, words, f"{least_:.1f} × ({system}, {row})", least_ >= TIMES_FASTER)
+    typical = median([ratio for ratio, _, _ in times])
+    told = f"{least_:.1f} × ({system}, {row}); in the median of those rows ({len(times)}) {typical:.1f} ×"
+    return Claim(what, words, told, least_ >= TIMES_FASTER)
+
+
+def _seconds(rows: Sequence[Row]) -> float:
+    return middle(rows, lambda row: row.total_s)
 
 
 def nearer(results: Results) -> Claim:
