@@ -89,6 +89,16 @@ def test_each_detection_is_taken_for_the_place_nearest_to_it_and_once() -> None:
     assert {place: one.id for place, one in taken.items()} == {1: 1, 0: 2}
 
 
+def test_what_was_swapped_is_taken_for_the_element_in_whose_place_another_stands() -> None:
+    model = build_model(BRACKET, SMALL)
+    places = placed(BRACKET, at(0, 0), at(5, 0)).placements
+    away = replace(detection(1, at(-1, 0)), instead_of="another")  # nearer to the first, which is missing
+    middle = model.symmetry.centre + np.array([5.0, 0.0, 0.0])
+    other = replace(detection(2, at(5, 0)), model="another", instead_of="bracket", pivot=tuple(middle.tolist()))
+    assert {place: one.id for place, one in assigned(model, places, [away, other]).items()} == {1: 1}
+    assert {place: one.id for place, one in assigned(model, places, [away]).items()} == {0: 1}
+
+
 @given(st.integers(0, 2**32 - 1), st.integers(0, 8), st.integers(1, 8))
 @settings(max_examples=50, deadline=None)
 def test_of_all_pairs_the_nearest_are_taken_first(seed: int, count: int, wanted: int) -> None:

@@ -100,7 +100,7 @@ def elements_of(
     stations : their numbers
     """
     placements, found = placements_of(model), []
-    taken = assigned(model, placements, [one for one in detections if one.model == model.name])
+    taken = assigned(model, placements, detections)
     for place, placement in enumerate(placements):
         by_each, one = said[place], taken.get(place)
         spoken = Spoken(*by_each.sum(axis=0).tolist()) if len(by_each) else None
@@ -110,14 +110,22 @@ def elements_of(
 
 
 def assigned(model: Model, placements: Sequence[Placement], detections: Iterable[Detection]) -> dict[int, Detection]:
-    """Which detection is taken for which placement (by number): the nearest pair first, each once."""
-    listed, some, centre = list(detections), model.samples.points[:PAIRED_BY], model.symmetry.centre[None]
+    """Which detection of a model is taken for which placement (by number): the nearest pair first, each once.
+
+    What stands in another's place is first taken for an element in whose place another stands.
+    """
+    every, some, centre = list(detections), model.samples.points[:PAIRED_BY], model.symmetry.centre[None]
+    listed = [one for one in every if one.model == model.name]
     there = np.array([placement.design_from_model.move(centre)[0] for placement in placements]).reshape(-1, 1, 3)
     here = np.array([one.scene_from_model.move(centre)[0] for one in listed]).reshape(-1, 3)
     # Between its points, so the farthest of these is off by more: most pairs are never looked at closely.
     least = np.linalg.norm(there - here, axis=2)
-    taken: dict[int, Detection] = {}
-    free, pairs = set(range(len(listed))), list[tuple[float, int, int, int]]()
+    others = [np.array(one.pivot) for one in every if one.instead_of and one.pivot and one.model != model.name]
+    left = [k for k, place in enumerate(there[:, 0]) if any(np.linalg.norm(place - other) < FAR_M for other in others)]
+    swapped = [number for number, one in enumerate(listed) if one.instead_of]
+    taken = {place: listed[number] for place, number in zip(left, swapped, strict=False)}
+    free = set(range(len(listed))) - set(swapped[: len(left)])
+    pairs = list[tuple[float, int, int, int]]()
 
     def settle(nearer_than: float) -> None:
         while pairs and pairs[0][0] < nearer_than:

@@ -67,6 +67,12 @@ class Refined(NamedTuple):
         return Refined(self.hypotheses.take(which), self.hessians[which], self.matched[which], self.rms[which])
 
 
+def as_they_are(hypotheses: Hypotheses) -> Refined:
+    """Poses that no ICP was asked of."""
+    count = len(hypotheses.models)
+    return Refined(hypotheses, np.zeros((count, 6, 6)), np.zeros(count), np.full(count, np.inf))
+
+
 def icp(
     hypotheses: Hypotheses, surfels: Surfels, arrays: ModelArrays, signed: bool, gates: Floats, most_samples: int,
     normal_agreement: float, jobs: int,

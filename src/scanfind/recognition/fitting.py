@@ -67,30 +67,35 @@ class Fitting:
         better = better.take(distinct(better, self._ground.arrays, self.apart, kept, MOST_AT_ONCE // 2))
         fine = self.fine(better.take(self._weighing.promising(better, LOOKED_AT)))
         if self._weighing.lines and self._ground.parameters.refine.raw_steps:
-            fine = self._on_beams(fine, self._weighing.lines.beyond_chance(fine.hypotheses) > 0.0)
+            fine = self.on_beams(fine, self._weighing.lines.beyond_chance(fine.hypotheses) > 0.0)
         fine = fine.take(np.argsort(-fine.matched, kind="stable"))
         # What ended at one place is asked once.
         return fine.take(distinct(fine.hypotheses, self._ground.arrays, self._the_same, kept, MOST_AT_ONCE // 2))
 
-    def _on_beams(self, refined: Refined, some: NDArray[np.bool_]) -> Refined:
+    def on_beams(self, refined: Refined, some: NDArray[np.bool_]) -> Refined:
         """Refined poses, some of them (H,) fitted to where beams ended that went towards them.
 
-        Where cells are too empty for normals ICP ends within half a cell; held against the model's own faces the beams
-        themselves bring that to a millimetre, in ten milliseconds.
+        Where cells are too empty for normals, or a model is thinner than they are, ICP ends within a cell; held against
+        the model's own faces the beams themselves bring that to a millimetre, in ten milliseconds.
         """
         refine = self._ground.parameters.refine
         found, models, scene = refined.hypotheses, self._ground.models, self._ground.scene
         for k in np.flatnonzero(some):
             number = int(found.models[k])
-            if number not in self._near:
-                self._near[number] = near_model(models[number], ON_BEAMS_CELLS * scene.fine.cell)
             pose = Pose(found.rotations[k], found.translations[k])
             for _ in range(ON_BEAMS_STEPS):
                 ends = towards(models[number], pose, scene.beams).ends()
-                fitted = polish(self._near[number], pose, ends, np.zeros(len(ends), np.int64), refine)
+                fitted = polish(self.near(number), pose, ends, np.zeros(len(ends), np.int64), refine)
                 pose = fitted.scene_from_model if fitted else pose
             found.rotations[k], found.translations[k] = pose.rotation, pose.translation
         return refined
+
+    def near(self, model: int) -> NearSurface:
+        """The surface of a model, to be asked for distances up to ON_BEAMS_CELLS fine cells."""
+        if model not in self._near:
+            reach = ON_BEAMS_CELLS * self._ground.scene.fine.cell
+            self._near[model] = near_model(self._ground.models[model], reach)
+        return self._near[model]
 
     def _far_from(self, hypotheses: Hypotheses, met: Hypotheses) -> NDArray[np.intp]:
         """The hypotheses that would not be drawn to where those in `met` went already (indices)."""

@@ -13,9 +13,10 @@ from scanfind.design.elements import LEAST_LOOKED_AT, placements_of
 from scanfind.evidence.free_space import Design
 from scanfind.evidence.rays import RayCaster
 from scanfind.evidence.verify import score, why_refused
-from scanfind.fit.refine import Refined, held, shrinking
+from scanfind.fit.refine import Refined, as_they_are, held, shrinking
 from scanfind.pose import Pose
-from scanfind.recognition.candidate import Candidate
+from scanfind.recognition.around import STEPS_M, across, beside, long_side, of_others, peaks
+from scanfind.recognition.candidate import Candidate, Standing
 from scanfind.recognition.claims import Claims
 from scanfind.recognition.swaps import GAIN, explained, looked_at, onto, pairs_alike
 from scanfind.search.hypotheses import joined
@@ -32,9 +33,9 @@ Floats = NDArray[np.float64]
 
 DRAWN_IN_CELLS = (2.0, 0.75)  # of the largest: how far off its design an element is met at once …
 FARTHER_IF = 1.2  # … where so many more of its samples meet the scan there than about the design
-# Where an element that is not in its place is looked for beside it, across its length; and how far off it then may be.
-AROUND_M, AROUND_MOST_M = (-0.04, 0.0, 0.04), 0.12
 IN_PLACE_M = 0.06  # what ICP carried no farther off is still where the design puts it
+AROUND_MOST_M = 0.12  # what is found beside the place of an element is no farther off than this …
+STANDS_OUT_M, STANDS_OUT = 0.04, 0.25  # … and so far to each side so much less of what is looked at is explained
 
 
 class Asked(NamedTuple):
@@ -56,8 +57,11 @@ NOTHING = Asked({}, {}, None)
 class InPlace:
     """The poses a design gives, tried, and what is believed of them."""
 
-    def __init__(self, ground: Ground, fitting: Fitting, weighing: Weighing, asked: Asked) -> None:
+    def __init__(
+        self, ground: Ground, fitting: Fitting, weighing: Weighing, asked: Asked, standing: Sequence[Standing] = ()
+    ) -> None:
         self._ground, self._fitting, self._weighing, self._asked = ground, fitting, weighing, asked
+        self._standing = standing
         self._places: list[Placement] = []
 
     def wanted(self) -> NDArray[np.intp]:
@@ -92,10 +96,23 @@ class InPlace:
         far = self._fitting.coarse(far.hypotheses)
         farther = far.matched > FARTHER_IF * near.matched
         start = joined([near.hypotheses, far.hypotheses]).take(np.arange(len(farther)) + len(farther) * farther)
-        found = self._fitting.fine(start)
-        self._hold(found, hypotheses)
+        found = self._fitted(start, hypotheses)
         both = joined([hypotheses, found.hypotheses])
         return Refined(both, np.tile(found.hessians, (2, 1, 1)), np.tile(found.matched, 2), np.tile(found.rms, 2))
+
+    def _fitted(self, start: Hypotheses, designs: Hypotheses) -> Refined:
+        """Poses fitted to fine surfels, drawn back to their designs along what these hardly fix, and fitted to beams.
+
+        The edges of a flat bar of 8 mm are lost in cells of 20 mm: from its true pose ICP carried it 14 mm across, to
+        where the rest of it lies on its neighbours.
+        """
+        found = self._fitting.fine(start)
+        self._hold(found, designs)
+        return self._on_beams(found)
+
+    def _on_beams(self, found: Refined) -> Refined:
+        """Poses fitted to where beams end; as they are where raw points are not asked."""
+        return self._fitting.on_beams(found, np.full(len(found.matched), self._ground.parameters.refine.raw_steps > 0))
 
     def _hold(self, found: Refined, designs: Hypotheses) -> None:
         """Draw refined poses back to their designs along what the scan hardly fixes."""
@@ -105,20 +122,48 @@ class InPlace:
             pose = held(design, pose, found.hessians[k], centres[number], float(radii[number]))
             found.hypotheses.rotations[k], found.hypotheses.translations[k] = pose.rotation, pose.translation
 
-    def _around(self, asked: Candidate) -> Candidate:
-        """The best of poses that ICP reaches from beside the design's, across its length, held as that one is.
+    def _around(self, asked: Candidate, moved: Candidate, others: Sequence[Standing]) -> Candidate | None:
+        """What stands beside the place of an element that is not in it; None where nothing does that is its own.
 
-        What is thinner than it was moved is not drawn in from there: a plate of 8 mm that stands 60 mm off has
-        other surfaces nearer to its place than its own.
+        moved : where ICP carried it; others : what else stands
         """
-        ground, pose = self._ground, asked.pose()
-        points = ground.models[asked.model].samples.points
-        across = pose.turn(np.eye(3)[np.argsort(np.ptp(points, axis=0), kind="stable")[:2]])
-        shifts = [one * across[0] + other * across[1] for one in AROUND_M for other in AROUND_M if one or other]
-        starts = ground.placements(asked.model, [Pose(pose.rotation, pose.translation + shift) for shift in shifts])
-        found = self._fitting.fine(self._fitting.coarse(starts).hypotheses)
-        self._hold(found, ground.placements(asked.model, [pose] * len(shifts)))
-        return max([asked, *self._weighing.candidates(found, in_place=True)], key=lambda candidate: candidate.score)
+        ground, number = self._ground, asked.model
+        model = ground.models[number]
+        starts = beside(asked.pose(), model.samples.points)
+        said = [self._weighing.spoken_of(number, each, in_place=True) for each in starts]
+        best = peaks(np.array([explained(each) for each in said]).reshape(len(STEPS_M), -1))
+        found = self._on_beams(self._on_beams(as_they_are(ground.placements(number, [starts[k] for k in best]))))
+        for each in sorted(
+            [moved, *self._weighing.candidates(found, in_place=True)], key=lambda c: -explained(c.evidence.spoken)
+        ):
+            if ground.apart(each, asked) > AROUND_MOST_M or self.why_not(each) or not self._stands_out(each):
+                continue
+            one = self._at_its_ends(each)
+            met = self._weighing.witnesses.met(model, one.pose())
+            shared = of_others(*met, others, self._weighing.fine.inlier)
+            if shared <= ground.parameters.verify.shared and not ground.why_not_allowed(one):
+                return one
+        return None
+
+    def _stands_out(self, found: Candidate) -> bool:
+        """Does a pose explain more than those beside it on every side? On a wall as much is explained all about."""
+        pose, said = found.pose(), found.evidence.spoken
+        beside = [
+            Pose(pose.rotation, pose.translation + shift)
+            for shift in STANDS_OUT_M * across(pose, self._ground.models[found.model].samples.points)
+        ]
+        most = max(explained(self._weighing.spoken_of(found.model, each, in_place=True)) for each in beside)
+        return most < explained(said) - STANDS_OUT * looked_at(said)
+
+    def _at_its_ends(self, found: Candidate) -> Candidate:
+        """A pose as far along the length of its model as beams say; as it is where they do not."""
+        pose, model = found.pose(), self._ground.models[found.model]
+        along = pose.turn(long_side(model.samples.points)[None])[0]
+        told = self._weighing.witnesses.slid(model, pose, along, 0.0)
+        if told is None:
+            return found
+        at = Pose(pose.rotation, pose.translation + told.by * along)
+        return self._weighing.candidates(as_they_are(self._ground.placements(found.model, [at])), in_place=True)[0]
 
     def believe(
         self, refined: Refined, before: Sequence[Candidate]
@@ -132,28 +177,23 @@ class InPlace:
         Returns what is believed besides, and what is not and why.
         """
         ground, found = self._ground, self._weighing.candidates(refined, in_place=True)
-        believed, refused, elsewhere, missed = list[Candidate](), [], [], []
+        believed, refused, elsewhere = list[Candidate](), [], []
         asked_all, moved_all = found[: len(found) // 2], found[len(found) // 2 :]
         bests = [self._better(*pair) for pair in zip(moved_all, asked_all, strict=True)]
+        around = {} if ground.blind else self._beside(asked_all, bests, before)
+        bests = [around.get(k, best) for k, best in enumerate(bests)]
         swapped = {} if ground.blind else self._swapped(bests)
         for k, (asked, best) in enumerate(zip(asked_all, bests, strict=True)):
-            if k in swapped:
-                believed.append(swapped[k])
+            if k in swapped or k in around:
+                believed.append(swapped.get(k, best))
             elif ground.apart(best, asked) > IN_PLACE_M:
                 told = score(best.evidence, ground.blind, ground.parameters.verify)
                 elsewhere.append(best._replace(score=told, in_place=False))
             elif reason := self.why_not(best):
                 refused.append((best, reason))
-                missed.append(asked)
             else:
                 believed.append(best)
         claims = Claims(ground, [*before, *believed])
-        for asked in missed if not ground.blind else ():
-            best = self._around(asked)
-            near = ground.apart(best, asked) < AROUND_MOST_M and not claims.hold(best)
-            if near and not self.why_not(best):
-                believed.append(best)
-                claims.add(best)
         for candidate in sorted(elsewhere, key=lambda c: -c.area):
             if reason := ground.why_not_believed(candidate):
                 refused.append((candidate, reason))
@@ -162,9 +202,31 @@ class InPlace:
                 claims.add(candidate)
         return believed, refused
 
+    def _beside(
+        self, asked: Sequence[Candidate], bests: Sequence[Candidate], before: Sequence[Candidate]
+    ) -> dict[int, Candidate]:
+        """By number of the place what stands beside it, of those that nothing stands in."""
+        ground, found = self._ground, dict[int, Candidate]()
+        empty = [
+            k
+            for k, (place, best) in enumerate(zip(asked, bests, strict=True))
+            if ground.apart(best, place) > IN_PLACE_M or self.why_not(best)
+        ]
+        sound = [best for k, best in enumerate(bests) if k not in empty]
+        others = [*self._standing, *map(self._stands, [*before, *sound])]
+        for k in empty:
+            if one := self._around(asked[k], bests[k], others):
+                found[k] = one
+                others.append(self._stands(one))
+        return found
+
+    def _stands(self, candidate: Candidate) -> Standing:
+        """What is believed, as others are told of it."""
+        return Standing(self._fitting.near(candidate.model), self._ground.in_scans(candidate.pose()))
+
     def _better(self, moved: Candidate, asked: Candidate) -> Candidate:
         """Of a pose as the design gives it and as ICP leaves it the better; one carried off only if the other fails."""
-        best = max(moved, asked, key=lambda candidate: candidate.score)
+        best = max(asked, moved, key=lambda candidate: candidate.score)
         return asked if self._ground.apart(best, asked) > IN_PLACE_M and not self.why_not(asked) else best
 
     def _swapped(self, bests: Sequence[Candidate]) -> dict[int, Candidate]:
@@ -201,8 +263,7 @@ class InPlace:
         ways = [pose @ way for way in onto(self._ground.models[model], self._ground.models[stands.model])]
         best = max(ways, key=lambda way: explained(self._weighing.spoken_of(model, way)))
         start = self._ground.placements(model, [best])
-        refined = self._fitting.fine(start)
-        self._hold(refined, start)
+        refined = self._fitted(start, start)
         asked, found = (
             self._weighing.candidates(each, in_place=True)[0] for each in (refined._replace(hypotheses=start), refined)
         )

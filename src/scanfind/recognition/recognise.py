@@ -68,7 +68,8 @@ class Recognition:
         assemblies = Assemblies(models, view, parameters.assembly, ground.blind)
         self.telling = Telling(ground, assemblies)
         self._by_parts = ByParts(ground, assemblies, self.fitting.apart)
-        self._asked, self._in_place = asked, InPlace(ground, self.fitting, self.weighing, asked or NOTHING)
+        self._asked = asked
+        self._in_place = InPlace(ground, self.fitting, self.weighing, asked or NOTHING, standing)
         # What surface found elsewhere need not be looked for by lines here.
         self._by_lines = np.array([not share for share in learnt or [0.0] * len(models)])
         self._seed, self._standing = seed, standing

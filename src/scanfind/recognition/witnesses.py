@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from scanfind.design.elements import Element, assigned, elements_of, open_slide, placements_of, said_by
 from scanfind.detection import Detection, Motion
-from scanfind.evidence.ends import slid
-from scanfind.evidence.free_space import Limits, caster_of, spoken_by_each
+from scanfind.evidence.ends import Slid, slid
+from scanfind.evidence.free_space import ON, Limits, caster_of, spoken_by_each, verdicts
 from scanfind.fit.refine import triple
 from scanfind.pose import Pose
 
@@ -49,9 +49,21 @@ class Witnesses:
 
         in_place : of where the design puts it
         """
+        return spoken_by_each(model, *self._asks(model, placed, in_place=in_place))
+
+    def met(self, model: Model, placed: Pose) -> tuple[Floats, Floats]:
+        """Where beams meet a model as the design puts it, (N, 3) in the scans' own frame, and of how much, (N,) m²."""
+        met = verdicts(model, *self._asks(model, placed, in_place=True))
+        on = met.says == ON
+        return placed.move(met.where[on]) + self.offset, met.area[on]
+
+    def _asks(
+        self, model: Model, placed: Pose, *, in_place: bool
+    ) -> tuple[RayCaster, Pose, Sequence[Beams], Limits, Design | None, Floats]:
+        """What beams are asked of a model with: see `verdicts`."""
         limits = self.limits._replace(edge=EDGE_INLIERS * self.limits.inlier) if in_place else self.limits
         design = self.design if in_place else None
-        return spoken_by_each(model, self._caster(model), placed, self.beams, limits, design, self.offset)
+        return self._caster(model), placed, self.beams, limits, design, self.offset
 
     def say_at(self, model: Model, pose: Pose) -> Floats:
         """What each says of a model at a pose in the scans' own frame: as `say_by_each`, in place where asked so."""
@@ -68,7 +80,7 @@ class Witnesses:
     def with_ends(self, model: Model, detections: Sequence[Detection]) -> dict[int, Detection]:
         """By id the detections of a model that stand for an element, each `at_its_ends`."""
         places = placements_of(model)
-        taken = assigned(model, places, [one for one in detections if one.model == model.name])
+        taken = assigned(model, places, detections)
         return {one.id: self.at_its_ends(model, one, places[place].design_from_model) for place, one in taken.items()}
 
     def at_its_ends(self, model: Model, found: Detection, design: Pose) -> Detection:
@@ -82,10 +94,7 @@ class Witnesses:
         centre = model.symmetry.centre[None]
         alike = model.symmetry.nearest(design, placed.rotation)
         from_here = float((alike.move(centre) - placed.move(centre))[0] @ along)
-        told = slid(
-            model, self._caster(model), self._in_grid(placed), along, from_here, self.beams, self.limits, self.design,
-            self.offset,
-        )  # fmt: skip
+        told = self.slid(model, self._in_grid(placed), along, from_here)
         if told is None:
             return found
         step, covariance = told.by * along, found.covariance.copy()
@@ -97,6 +106,11 @@ class Witnesses:
             pivot=triple(np.array(found.pivot) + step), slide=triple(along),
             unobservable=(*others, Motion("slide", triple(own), triple(centre[0]), told.sigma)),
         )  # fmt: skip
+
+    def slid(self, model: Model, placed: Pose, along: Floats, design: float) -> Slid | None:
+        """How far a model at a pose relative to the grid's offset has to slide along a direction: see `ends.slid`."""
+        caster = self._caster(model)
+        return slid(model, caster, placed, along, design, self.beams, self.limits, self.design, self.offset)
 
     def with_stations(self, model: Model, found: Detection, stations: Floats) -> Detection:
         """A detection of a model with what each station says of it; stations : see `elements`."""
