@@ -225,9 +225,15 @@ class InPlace:
         return Standing(self._fitting.near(candidate.model), self._ground.in_scans(candidate.pose()))
 
     def _better(self, moved: Candidate, asked: Candidate) -> Candidate:
-        """Of a pose as the design gives it and as ICP leaves it the better; one carried off only if the other fails."""
+        """Of a pose as the design gives it and as ICP leaves it the better; one carried off only if the other fails.
+
+        What fails in its place is believed beside it only where it stands out.
+        """
         best = max(asked, moved, key=lambda candidate: candidate.score)
-        return asked if self._ground.apart(best, asked) > IN_PLACE_M and not self.why_not(asked) else best
+        if best is asked or not self.why_not(asked):
+            return asked if self._ground.apart(best, asked) > IN_PLACE_M else best
+        near = self._ground.apart(best, asked) <= IN_PLACE_M and not self._ground.blind
+        return asked if near and not self._stands_out(best) else best
 
     def _swapped(self, bests: Sequence[Candidate]) -> dict[int, Candidate]:
         """By number of the place what stands in it, where two elements stand in each other's.
