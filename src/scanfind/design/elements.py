@@ -121,7 +121,8 @@ def assigned(model: Model, placements: Sequence[Placement], detections: Iterable
     # Between its points, so the farthest of these is off by more: most pairs are never looked at closely.
     least = np.linalg.norm(there - here, axis=2)
     others = [np.array(one.pivot) for one in every if one.instead_of and one.pivot and one.model != model.name]
-    left = [k for k, place in enumerate(there[:, 0]) if any(np.linalg.norm(place - other) < FAR_M for other in others)]
+    far = [np.linalg.norm(there[:, 0] - other, axis=1) for other in others]
+    left = dict.fromkeys(int(each.argmin()) for each in far if each.min() < FAR_M)
     swapped = [number for number, one in enumerate(listed) if one.instead_of]
     taken = {place: listed[number] for place, number in zip(left, swapped, strict=False)}
     free = set(range(len(listed))) - set(swapped[: len(left)])
