@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scanfind.evidence.ends import FIXED, slid
+from scanfind.evidence.ends import FIXED, Slid, slid, with_faces
 from scanfind.evidence.free_space import Limits, caster_of, spoken_by_each
 from scanfind.grid.depth import Beams
 from scanfind.kernels.grid import NO_BEAM, cube_place, pack_beam
@@ -74,6 +74,22 @@ def test_a_slide_is_measured_wherever_icp_left_it(moved: float, carried: float) 
 def test_what_stands_as_designed_is_not_slid(carried: float) -> None:
     model = bar()
     assert slid(model, caster_of(model), at(carried), ALONG, -carried, bar_seen(0.0), LIMITS) is None
+
+
+@pytest.mark.parametrize("moved", [-0.02, 0.0, 0.002])
+def test_of_what_was_moved_the_ends_are_believed_though_they_do_not_refute_the_design(moved: float) -> None:
+    model = bar()
+    told = slid(model, caster_of(model), at(0.03), ALONG, None, bar_seen(moved), LIMITS)
+    assert told is not None
+    assert 0.03 + told.by == pytest.approx(moved, abs=max(FIXED * told.sigma, 0.005))
+
+
+def test_faces_and_ends_are_weighed_where_they_agree_and_the_ends_believed_where_not() -> None:
+    told = with_faces(Slid(0.002, 0.002), 0.001**2)
+    assert told.by == pytest.approx(0.0004)
+    assert told.sigma**-2 == pytest.approx(0.002**-2 + 0.001**-2)
+    assert with_faces(Slid(0.02, 0.002), 0.001**2) == Slid(0.02, 0.002)
+    assert with_faces(Slid(0.002, 0.002), 0.0) == Slid(0.002, 0.002)
 
 
 def test_what_the_design_has_in_front_hides_and_is_not_beside() -> None:

@@ -29,6 +29,7 @@ COARSE, FINE_M = 31, 0.001  # beams that say the same in all of so many places s
 # Were each beam that changes its mind between two places a coin, the difference would be within so many times the root
 # of their number. Of the elements of a tuning scene that were not moved one exceeded it, along a neighbour's flange.
 SURE = 3.0
+AGREE = 2.0  # faces and ends that are farther apart than so many standard deviations speak of different things
 FIXED = 3.0  # a slide of less than so many times its standard deviation is none
 
 
@@ -40,16 +41,18 @@ class Slid(NamedTuple):
 
 
 def slid(
-    model: Model, caster: RayCaster, placed: Pose, along: Floats, design: float, scanners: Sequence[Beams],
+    model: Model, caster: RayCaster, placed: Pose, along: Floats, design: float | None, scanners: Sequence[Beams],
     limits: Limits, neighbours: Design | None = None, offset: Floats | None = None,
 ) -> Slid | None:  # fmt: skip
-    """How far a placed model has to slide for its ends to be where beams say; None where they do not refute the design.
+    """How far a placed model has to slide for its ends to be where beams say.
+
+    None where they do not refute the design or, of one that stands anywhere, leave it open.
 
     placed : scene_from_model, relative to the grid's offset; along : (3,) unit direction of the slide, scene axes
-    design : where along it the design has the model, metres from `placed`
+    design : where along it the design has the model, metres from `placed`; None: it was moved, and stands anywhere
     neighbours, offset : the whole design: what ended on others of it speaks for none; the grid's offset, (3,)
     """
-    if abs(design) >= REACH_M:
+    if design is not None and abs(design) >= REACH_M:
         return None
     coarse = np.linspace(-REACH_M, REACH_M, COARSE)
     points = placed.move(model.samples.points)
@@ -78,9 +81,22 @@ def slid(
     weight /= weight.sum()
     by = float(weight @ steps)
     sigma = max(float(np.sqrt(weight @ (steps - by) ** 2)), FINE_M)
-    here, there = votes(by, telling), votes(design, telling)
-    gain, changed = int(here.sum(dtype=np.int64) - there.sum(dtype=np.int64)), int(np.count_nonzero(here != there))
-    bounded = abs(by) + FIXED * sigma < REACH_M
-    if not bounded or abs(by - design) < FIXED * sigma or gain <= SURE * np.sqrt(changed):
+    if abs(by) + FIXED * sigma >= REACH_M:
         return None
+    if design is not None:
+        here, there = votes(by, telling), votes(design, telling)
+        gain, changed = int(here.sum(dtype=np.int64) - there.sum(dtype=np.int64)), int(np.count_nonzero(here != there))
+        if abs(by - design) < FIXED * sigma or gain <= SURE * np.sqrt(changed):
+            return None
     return Slid(by, sigma)
+
+
+def with_faces(told: Slid, variance: float) -> Slid:
+    """What ends say of a slide, and faces that put it at 0 with a variance, m²; 0: they say nothing of it.
+
+    Where the two disagree the ends are believed: faces take a neighbour's for their own where the two are flush.
+    """
+    if variance <= 0.0 or told.by**2 > AGREE**2 * (told.sigma**2 + variance):
+        return told
+    share = variance / (variance + told.sigma**2)
+    return Slid(share * told.by, float(np.sqrt(share) * told.sigma))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanfind.design.elements import Element, assigned, elements_of, open_slide, placements_of, said_by
 from scanfind.detection import Detection, Motion
-from scanfind.evidence.ends import Slid, slid
+from scanfind.evidence.ends import Slid, slid, with_faces
 from scanfind.evidence.free_space import ON, Limits, caster_of, spoken_by_each, verdicts
 from scanfind.fit.refine import triple
 from scanfind.pose import Pose
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 EDGE_INLIERS = 2.0  # a laser's spot is a centimetre wide at 10 m: nearer to the outline some of it went past
+MOVED_M = 0.01  # an element that is so far off across a slide was moved: along it nothing says that it was not
 ALONG = 0.95  # cosine between a slide and one that is the same
 
 
@@ -93,11 +94,17 @@ class Witnesses:
             return found
         centre = model.symmetry.centre[None]
         alike = model.symmetry.nearest(design, placed.rotation)
-        from_here = float((alike.move(centre) - placed.move(centre))[0] @ along)
-        told = self.slid(model, self._in_grid(placed), along, from_here)
+        shift = (alike.move(centre) - placed.move(centre))[0]
+        from_here = float(shift @ along)
+        stayed = np.linalg.norm(shift - from_here * along) < MOVED_M
+        told = self.slid(model, self._in_grid(placed), along, from_here if stayed else None)
         if told is None:
             return found
-        step, covariance = told.by * along, found.covariance.copy()
+        covariance = found.covariance.copy()
+        # What faces say of one motion is a variance only where they say something of all.
+        if all(each.sigma is not None for each in found.unobservable):
+            told = with_faces(told, float(along @ covariance[3:, 3:] @ along))
+        step = told.by * along
         covariance[3:, 3:] += told.sigma**2 * np.outer(along, along)
         own = placed.rotation.T @ along
         others = [each for each in found.unobservable if each.kind != "slide" or abs(np.dot(each.axis, own)) < ALONG]
@@ -107,7 +114,7 @@ class Witnesses:
             unobservable=(*others, Motion("slide", triple(own), triple(centre[0]), told.sigma)),
         )  # fmt: skip
 
-    def slid(self, model: Model, placed: Pose, along: Floats, design: float) -> Slid | None:
+    def slid(self, model: Model, placed: Pose, along: Floats, design: float | None) -> Slid | None:
         """How far a model at a pose relative to the grid's offset has to slide along a direction: see `ends.slid`."""
         caster = self._caster(model)
         return slid(model, caster, placed, along, design, self.beams, self.limits, self.design, self.offset)
