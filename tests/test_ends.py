@@ -18,6 +18,7 @@ from scanfind.library.surface import SurfaceParameters
 from scanfind.pose import Pose
 from scanfind.recognition.in_place import design_of
 from scanfind.recognition.swaps import are_alike, onto, pairs_alike
+from scanfind.recognition.witnesses import known_along
 from scanfind.simulate.parts import blocks, box
 from scanfind.simulate.scanner import Scanner, scan
 from scanfind.simulate.scene import Scene, SceneObject
@@ -116,3 +117,18 @@ def test_a_model_is_put_onto_another_side_along_side_and_middle_to_middle() -> N
         points = way.move(one.samples.points)
         np.testing.assert_allclose(0.5 * (points.min(axis=0) + points.max(axis=0)), 0.5 * (low + high), atol=0.01)
         assert np.argmax(np.ptp(points, axis=0)) == 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_covariance_has_the_variance_that_ends_and_faces_give_and_no_other_changes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    root, along = rng.normal(size=(6, 6)), rng.normal(size=3)
+    along /= np.linalg.norm(along)
+    covariance, six = root @ root.T, np.concatenate([np.zeros(3), along])
+    others = np.linalg.svd(six[None])[2][1:]  # (5, 6) across it
+    before = float(six @ covariance @ six)
+    for known in (before, 0.0):
+        found = known_along(covariance, along, known, 0.25)
+        assert np.linalg.eigvalsh(found).min() > 0.0
+        assert np.isclose(six @ found @ six, 0.25 if known else before + 0.25)
+        np.testing.assert_allclose(others @ found @ others.T, others @ covariance @ others.T)

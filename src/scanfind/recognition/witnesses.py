@@ -100,16 +100,17 @@ class Witnesses:
         told = self.slid(model, self._in_grid(placed), along, from_here if stayed else None)
         if told is None:
             return found
-        covariance = found.covariance.copy()
         # What faces say of one motion is a variance only where they say something of all.
+        by_faces = 0.0
         if all(each.sigma is not None for each in found.unobservable):
-            told = with_faces(told, float(along @ covariance[3:, 3:] @ along))
+            by_faces = float(along @ found.covariance[3:, 3:] @ along)
+        told = with_faces(told, by_faces)
         step = told.by * along
-        covariance[3:, 3:] += told.sigma**2 * np.outer(along, along)
         own = placed.rotation.T @ along
         others = [each for each in found.unobservable if each.kind != "slide" or abs(np.dot(each.axis, own)) < ALONG]
         return replace(
-            found, scene_from_model=Pose(placed.rotation, placed.translation + step), covariance=covariance,
+            found, scene_from_model=Pose(placed.rotation, placed.translation + step),
+            covariance=known_along(found.covariance, along, by_faces, told.sigma**2),
             pivot=triple(np.array(found.pivot) + step), slide=triple(along),
             unobservable=(*others, Motion("slide", triple(own), triple(centre[0]), told.sigma)),
         )  # fmt: skip
@@ -137,3 +138,17 @@ class Witnesses:
         if model.name not in self._casters:
             self._casters[model.name] = caster_of(model)
         return self._casters[model.name]
+
+
+def known_along(covariance: Floats, along: Floats, before: float, now: float) -> Floats:
+    """A pose's covariance (6, 6) where a shift along a unit direction (3,) has another variance than before, m².
+
+    How it goes with the other motions stays as it was; of what was not known at all, 0, it goes with none.
+    """
+    way, scale = np.outer(along, along), np.eye(6)
+    if before > 0.0:
+        scale[3:, 3:] += (np.sqrt(now / before) - 1.0) * way
+        return np.asarray(scale @ covariance @ scale.T)
+    found = covariance.copy()
+    found[3:, 3:] += now * way
+    return found
