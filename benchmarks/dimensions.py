@@ -15,8 +15,9 @@ from benchmarks.common import seeds_of, tell, write_csv
 from scanfind.detection import ANGLE, LINEAR, RADIUS
 from scanfind.dimensions import Plan, plan_of
 from scanfind.dimensions.fits import designed
+from scanfind.isolation.own import IsolationParameters
 from scanfind.mesh import Mesh
-from scanfind.parameters import IsolationParameters, Parameters
+from scanfind.parameters import Parameters
 from scanfind.pose import Pose, random_rotation
 from scanfind.simulate.equipment import TOWARDS_X
 from scanfind.simulate.objects import RIGHT_ANGLE, Route

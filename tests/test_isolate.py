@@ -17,10 +17,9 @@ from scanfind.cloud import OrientedCloud, PointChunk
 from scanfind.detection import Detection, IsolatedPoints
 from scanfind.errors import InvalidGeometryError, UsageError
 from scanfind.isolation.isolate import IsolateParameters, Isolator, Placed, isolate, left_over
+from scanfind.isolation.own import IsolationParameters, with_own_points
 from scanfind.library.near_surface import near_samples, near_triangles, signed_distances
-from scanfind.parameters import IsolationParameters
 from scanfind.pose import Pose
-from scanfind.second_pass import with_own_points
 
 Floats = NDArray[np.float64]
 

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 from scanfind.clock import Clock, say_if_compiling, watched
 from scanfind.detection import Findings
 from scanfind.errors import UsageError
+from scanfind.isolation.own import within
 from scanfind.library import ModelLibrary
 from scanfind.results import MODELS, fill_folder, open_remainder, read_results, result_folder, schema
 from scanfind.results.document import findings_of
 from scanfind.scans.sources import Sources
-from scanfind.second_pass import plans_of, surfaces_of, with_dimensions, with_points, within, write_left_over
+from scanfind.second_pass import plans_of, surfaces_of, with_dimensions, with_points, write_left_over
 from scanfind.threads import available_cores
 from scanfind.tolerances import judge_findings, profile_in
 

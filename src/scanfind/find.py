@@ -11,6 +11,7 @@ from scanfind.errors import require
 from scanfind.fit.polish import polished
 from scanfind.grid.moments import MomentGrid
 from scanfind.grid.scene import build_scene
+from scanfind.isolation.own import isolation_gate, with_own_points
 from scanfind.library import joint_table
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.priors.allowed import box_searched, require_points_in
@@ -20,12 +21,10 @@ from scanfind.recognition.sizes import Sizes
 from scanfind.scale import in_metres, scan_scale
 from scanfind.scans.sources import Scan, Sources, require_points
 from scanfind.second_pass import (
-    isolation_gate,
     near_parts,
     plans_of,
     surfaces_of,
     with_dimensions,
-    with_own_points,
     with_points,
     write_left_over,
 )

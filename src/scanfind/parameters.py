@@ -5,35 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from scanfind.assembly.parameters import AssemblyParameters
-from scanfind.errors import require
 from scanfind.evidence.verify import VerifyParameters
 from scanfind.fit.refine import RefineParameters
 from scanfind.grid.scene import GridParameters
+from scanfind.isolation.own import IsolationParameters
 from scanfind.library.pairs import PairParameters
 from scanfind.library.surface import SurfaceParameters
 from scanfind.priors import Priors
 from scanfind.search.surface import SearchParameters
-
-
-@dataclass(frozen=True)
-class IsolationParameters:
-    """Which raw points belong to a detection.
-
-    tolerance_m : those within this distance of the placed model's surface; None: each detection's own
-    noises : that is so many times what its points spread about it (1.48 times the median of their distances), at least
-        a tenth of the grid's finest cell and at most half of that it was found with
-    dimensions : measure what a drawing would dimension; a second a model, and a tenth of one a detection
-    """
-
-    tolerance_m: float | None = None
-    noises: float = 4.0
-    dimensions: bool = False
-
-    def __post_init__(self) -> None:
-        require(
-            self.tolerance_m is None or self.tolerance_m > 0.0, "tolerance_m", self.tolerance_m, "a positive length"
-        )
-        require(self.noises > 0.0, "noises", self.noises, "more than 0")
 
 
 @dataclass(frozen=True)

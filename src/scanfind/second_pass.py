@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,9 +10,9 @@ from numpy.typing import NDArray
 
 from scanfind.assembly import REACH_M
 from scanfind.dimensions import Plan, dimensioned, plan_of
-from scanfind.isolation.deviation import deviation_of
-from scanfind.isolation.isolate import IsolateParameters, Placed, left_over, nearer
+from scanfind.isolation.isolate import IsolateParameters, Placed, left_over
 from scanfind.isolation.isolate import isolate as isolate_raw
+from scanfind.isolation.own import within
 from scanfind.library.near_surface import near_model, near_triangles
 from scanfind.pose import Pose
 
@@ -22,45 +21,9 @@ if TYPE_CHECKING:
     from scanfind.detection import Detection, IsolatedPoints
     from scanfind.kernels.distance import NearSurface
     from scanfind.library.model import Model
-    from scanfind.parameters import IsolationParameters
     from scanfind.scans import CloudWriter
 
 Floats = NDArray[np.float64]
-
-
-# Twice what the grid takes for noise: it is a fifth too small where points are many, and cut off there their own spread
-# looks smaller still. Where they are few, cells are large, and what bends within them looks like noise: 15 times it.
-GATE = 2.0
-LEAST_CELLS = 0.1  # of the finest cell: points without noise are rounded, and their pose is off by some of that
-
-
-def isolation_gate(parameters: IsolationParameters, noise: float, cell: float) -> float:
-    """Within how many metres of a placed surface a raw point may belong to it, by the noise that the grid tells."""
-    if parameters.tolerance_m is not None:
-        return parameters.tolerance_m
-    return min(max(GATE * parameters.noises * noise, LEAST_CELLS * cell), 0.5 * cell)
-
-
-def with_own_points(found: Detection, parameters: IsolationParameters, gate: float, finest_cell: float) -> Detection:
-    """Of the points within the gate of a detection those that are its own: what spreads about it as most of them do.
-
-    found : fitted to these points; gate, finest_cell : metres
-    """
-    points = found.isolated
-    if points is None or not len(points) or parameters.tolerance_m is not None:
-        return replace(found, tolerance_m=None if points is None else gate)
-    # The median: up to half of the points may be those of a floor or a neighbour.
-    spread = 1.4826 * float(np.median(np.abs(points.deviation)))
-    tolerance = min(max(parameters.noises * spread, LEAST_CELLS * finest_cell), gate)
-    return within(found, points, tolerance)
-
-
-def within(found: Detection, points: IsolatedPoints, tolerance: float) -> Detection:
-    """A detection with those of some points that are no farther from it than a tolerance, metres."""
-    own = nearer(points, tolerance)
-    return replace(
-        found, isolated=own, deviation=deviation_of(own.deviation) if len(own) else None, tolerance_m=tolerance
-    )
 
 
 def surfaces_of(findings: Sequence[Detection], library: Sequence[Model], tolerance: float) -> dict[str, NearSurface]:

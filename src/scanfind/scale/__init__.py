@@ -22,9 +22,9 @@ from scanfind.fit.similarity import Similarity, agreed, similarity
 from scanfind.grid.moments import MomentGrid
 from scanfind.grid.scene import build_scene
 from scanfind.isolation.isolate import IsolateParameters, Placed, isolate
+from scanfind.isolation.own import IsolationParameters, isolation_gate
 from scanfind.library import joint_table
 from scanfind.library.near_surface import near_model
-from scanfind.parameters import IsolationParameters
 from scanfind.pose import Pose
 from scanfind.priors.allowed import middle_of
 from scanfind.recognition.fitting import Fitting
@@ -34,7 +34,6 @@ from scanfind.recognition.sizes import Sizes
 from scanfind.recognition.weighing import Weighing
 from scanfind.scale.steps import sized, sizes_tried, with_pairs
 from scanfind.search.hypotheses import Hypotheses, model_arrays
-from scanfind.second_pass import isolation_gate
 
 if TYPE_CHECKING:
     from scanfind.clock import Clock

@@ -36,12 +36,12 @@ from scanfind.design.elements import placements_of
 from scanfind.detection import Findings
 from scanfind.errors import Interrupted, UnreadableFileError, UnsupportedFormatError, UsageError
 from scanfind.grid.moments import MomentGrid
+from scanfind.isolation.own import isolation_gate
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.priors.allowed import box_searched, require_points_in
 from scanfind.recognition.sizes import Sizes
 from scanfind.results.document import fingerprint
 from scanfind.scans.sources import Scan
-from scanfind.second_pass import isolation_gate
 from scanfind.sought import ModelInput, models_of
 from scanfind.threads import available_cores
 from scanfind.tiles.listed import Listed, listed_of

@@ -10,7 +10,8 @@ import numpy as np
 from scanfind.dimensions import dimensioned
 from scanfind.fit.polish import polished
 from scanfind.isolation.deviation import deviation_of
-from scanfind.second_pass import with_own_points, write_left_over
+from scanfind.isolation.own import with_own_points
+from scanfind.second_pass import write_left_over
 from scanfind.tiles.tasks import Cut, Found, cut, gathered, on_disk, plan_in, surface_of
 from scanfind.tiles.work import Crew, all_done, no_room
 
