@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from scanfind.mesh import Mesh
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.pose import Pose, random_rotation
 from scanfind.recognition.sizes import Sizes
+from scanfind.scans import open_writer
 from scanfind.scans.sources import Sources
 from scanfind.simulate.furniture import hall
 from scanfind.simulate.objects import pipe_spool
@@ -226,6 +228,14 @@ def test_parts_that_are_alike_have_their_hypotheses_each() -> None:
     assert len(one.models) > 10
     np.testing.assert_array_equal(one.rotations, other.rotations)
     np.testing.assert_array_equal(one.translations, other.translations)
+
+
+def test_what_is_left_is_not_told_where_nothing_was_cut(tmp_path: Path) -> None:
+    with (
+        open_writer(tmp_path / "rest.ply", {"scan_id": np.dtype(np.int32)}) as rest,
+        pytest.raises(UsageError, match="remainder"),
+    ):
+        find(clouds(), library(), isolate=False, remainder=rest)
 
 
 def test_one_is_found_once() -> None:

@@ -67,7 +67,7 @@ def find(
         units : of model files whose format has none; select : which models of an IFC file
         progress : called with (stage, done, total), total -1 where nobody knows
         isolate : cut each detection's raw points in a second pass
-        remainder : takes every point that belongs to no detection
+        remainder : takes every point that belongs to no detection, in a third pass
         at_design : try where the design puts each model first, and say what became of every element: see
             `Findings.elements`; the scans are in the design's frame
     Returns the detections, best first; poses in the scans' own frame, metres; where the scale was free, in the scans
@@ -79,6 +79,7 @@ def find(
     require(seed >= 0, "seed", seed, "0 or more")
     free = parameters.priors.scale_free
     require(not (free and at_design), "scale_free", free, "0 where models are tried in their places")
+    require(isolate or remainder is None, "isolate", isolate, "True where a remainder is asked for")
     clock, tell = Clock(), progress or (lambda stage, done, total: None)
     findings = Findings()
 

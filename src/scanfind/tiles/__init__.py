@@ -34,7 +34,7 @@ from scanfind.clock import Clock, say_if_compiling
 from scanfind.cloud import shift_for
 from scanfind.design.elements import placements_of
 from scanfind.detection import Findings
-from scanfind.errors import Interrupted, UnreadableFileError, UnsupportedFormatError, UsageError
+from scanfind.errors import Interrupted, UnreadableFileError, UnsupportedFormatError, UsageError, require
 from scanfind.grid.moments import MomentGrid
 from scanfind.isolation.own import isolation_gate
 from scanfind.parameters import PRESETS, Parameters
@@ -119,6 +119,7 @@ def find_in_tiles(
     if parameters.priors.scale_free:
         msg = "find: a free scale is not found in tiles: leave out --scale-free, or --memory, --workers and --scheduler"
         raise UsageError(msg)
+    require(isolate or remainder is None, "isolate", isolate, "True where a remainder is asked for")
     tell = progress or (lambda stage, done, total: None)
     say_if_compiling(tell)
     clock = Clock()
