@@ -69,6 +69,8 @@ def curves(results: Results, experiment: str, key: str, left: Axes, right: Axes)
     for system, line in lines.items():
         ratio, rr, seconds = zip(*line, strict=True)
         look: dict[str, Any] = {"label": system, "color": COLOURS.get(system) or next(spare), "marker": "o"}
+        # Where all are at 1 the last one drawn hides the others: ours is told from them by its width.
+        look |= {"linewidth": 2.6, "zorder": 3.0} if system == FIRST[0] else {"linewidth": 1.1}
         if not all(math.isnan(value) for value in rr):
             left.plot(ratio, rr, markersize=3.0, **look)
         right.plot(ratio, seconds, markersize=3.0, **look)
