@@ -131,7 +131,7 @@ class InPlace:
         model = ground.models[number]
         starts = beside(asked.pose(), model.samples.points)
         said = [self._weighing.spoken_of(number, each, in_place=True) for each in starts]
-        best = peaks(np.array([explained(each) for each in said]).reshape(len(STEPS_M), -1))
+        best = peaks(np.array([explained(each) for each in said], np.float64).reshape(len(STEPS_M), -1))
         found = self._on_beams(self._on_beams(as_they_are(ground.placements(number, [starts[k] for k in best]))))
         for each in sorted(
             [moved, *self._weighing.candidates(found, in_place=True)], key=lambda c: -explained(c.evidence.spoken)
