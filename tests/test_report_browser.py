@@ -57,9 +57,14 @@ def pixels(png: bytes) -> NDArray[Any]:
         return np.asarray(picture.convert("RGB")).astype(int)
 
 
+def drawn(page: Page) -> None:
+    """Wait until all that was asked is drawn: on a busy machine a page stands before its first picture does."""
+    page.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
 def settled(page: Page) -> NDArray[Any]:
     """What the page looks like when all that was asked is drawn."""
-    page.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    drawn(page)
     return pixels(page.screenshot())
 
 
@@ -73,6 +78,7 @@ def viewer_box(page: Page) -> tuple[int, int, int, int]:
 
 def on_page(page: Page, item: int) -> tuple[float, float]:
     """Where on the page an item is: the middle of the plate it stands on."""
+    drawn(page)
     left, top, _, _ = viewer_box(page)
     middle = f"v.clouds[{item}].low.map((low, k) => low + v.clouds[{item}].size[k] * [0.5, 0.5, 0.06][k])"
     x, y = page.run(f"(v => v.onPage({middle}))({VIEWER})")
