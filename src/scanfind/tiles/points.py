@@ -9,8 +9,7 @@ import numpy as np
 
 from scanfind.dimensions import dimensioned
 from scanfind.fit.polish import polished
-from scanfind.isolation.deviation import deviation_of
-from scanfind.isolation.own import with_own_points
+from scanfind.isolation.own import with_own_points, within
 from scanfind.second_pass import write_left_over
 from scanfind.tiles.tasks import Cut, Found, cut, gathered, on_disk, plan_in, surface_of
 from scanfind.tiles.work import Crew, all_done, no_room
@@ -48,10 +47,9 @@ def isolate_all(
     measured = []
     for one in findings:
         cut_out = gathered(cuts, one.id)
-        with_points = one.with_points(cut_out, deviation_of(cut_out.deviation) if len(cut_out) else None)
         with clock("refine"):
             surface = surface_of(job.folder, one.model, tolerance)
-            fitted = polished(with_points, surface, job.parameters.refine, job.jobs)
+            fitted = polished(within(one, cut_out, tolerance), surface, job.parameters.refine, job.jobs)
             around = fitted.isolated
             fitted = with_own_points(fitted, job.parameters.isolate, tolerance, job.cell)
         if job.parameters.isolate.dimensions and around is not None:
