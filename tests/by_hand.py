@@ -121,7 +121,8 @@ def folder_by_hand(out: Path, *, names: Sequence[str] = ("B1", "B2", "B3"), poin
         found = Detection(number, "beam", pose, 0.97, 0.6, 0.97, 0.0, 0.6, 0.001)
         covariance = np.diag([1e-8] * 6)
         pivot = (1.0, 1.5 * number, 0.2)
-        findings.append(replace(found.with_points(cut, deviation_of(deviation)), covariance=covariance, pivot=pivot))
+        with_points = replace(found, isolated=cut, deviation=deviation_of(deviation))
+        findings.append(replace(with_points, covariance=covariance, pivot=pivot))
     for k, name in enumerate(names, 1):
         placement = Placement(f"gid{k}", "IfcBeam", name, Pose(np.eye(3), np.array([0.0, 1.5 * k, 0.0])))
         missing = Element(placement, "beam", NOT_FOUND, None, None, None, None, 0.0, 0.1, 0.6, 0.3, "missing")

@@ -201,7 +201,8 @@ def test_a_detection_gets_its_distances_from_where_it_is_now() -> None:
     before = np.nan_to_num(measured(near(BRACKET), PLACE @ NUDGE, xyz, 1)[0], nan=0.001)
     ids = np.arange(len(xyz))
     cut = IsolatedPoints(xyz, {}, np.array(ids % 2, np.int32), ids, before.astype(np.float32))
-    raw = Detection(1, "bracket", PLACE @ NUDGE, 0.9, 0.9, 0.9, 0.0, 0.9, 0.001).with_points(cut, deviation_of(before))
+    raw = Detection(1, "bracket", PLACE @ NUDGE, 0.9, 0.9, 0.9, 0.0, 0.9, 0.001)
+    raw = replace(raw, isolated=cut, deviation=deviation_of(before))
     found = polished(raw, near(BRACKET), TWICE, 2)
     assert found.covariance is not None
     assert found.isolated is not None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import isnan, nan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -201,10 +201,6 @@ class Detection:
     def sigma_rad(self) -> float:
         """By what angle the rotation is off, root mean square, radians; NaN without a covariance."""
         return float("nan") if self.covariance is None else float(np.sqrt(np.trace(self.covariance[:3, :3])))
-
-    def with_points(self, isolated: IsolatedPoints, deviation: Deviation | None) -> Detection:
-        """The same detection with its isolated points."""
-        return replace(self, isolated=isolated, deviation=deviation)
 
 
 @dataclass(frozen=True)
