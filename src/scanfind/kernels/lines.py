@@ -8,7 +8,7 @@ import numpy as np
 
 from scanfind.kernels.blocks import find_block, pack_block, unpack_block
 from scanfind.kernels.jit import kernel
-from scanfind.kernels.search import lies_on_scene
+from scanfind.kernels.search import lie_on_scene
 from scanfind.kernels.surfels import add_moved, smallest_eigenvector, sum_views
 
 
@@ -118,19 +118,19 @@ def shares_on_scene(
 ):  # fmt: skip
     """The share of a model's samples, placed, that lie in a cell marked with their direction, for poses start … stop.
 
-    See lies_on_scene; shares : (H,) out
+    See lie_on_scene; shares : (H,) out
     """
     inverse, nobody = 1.0 / cell, np.empty((0, 3))
+    endless = np.zeros(np.max(model_starts[1:] - model_starts[:-1]) + 1, np.int64)  # no test ends before all are asked
     rotation, translation = np.empty((3, 3)), np.empty(3)
     for k in range(start, stop):
         for i in range(3):
             translation[i] = translations[k, i]
             for j in range(3):
                 rotation[i, j] = rotations[k, i, j]
-        hits = 0
         first, end = model_starts[models[k]], model_starts[models[k] + 1]
-        for at in range(first, end):
-            hits += lies_on_scene(
-                samples, at, rotation, translation, nobody, inverse, hash_keys, hash_values, occupied, masks
-            )  # fmt: skip
+        hits, _ = lie_on_scene(
+            samples, first, end, endless, rotation, translation, nobody, inverse, hash_keys, hash_values, occupied,
+            masks,
+        )  # fmt: skip
         shares[k] = hits / max(end - first, 1)

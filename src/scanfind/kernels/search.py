@@ -188,36 +188,51 @@ def mark_orientations(means, normals, reach, cell, spread, signed, hash_keys, ha
 
 
 @kernel
-def lies_on_scene(samples, at, rotation, translation, origins, inverse, hash_keys, hash_values, occupied, masks):
-    """Does sample number `at` (point and normal), placed, lie in a cell marked with its normal's direction?
+def lie_on_scene(
+    samples, start, stop, least, rotation, translation, origins, inverse, hash_keys, hash_values, occupied, masks
+):  # fmt: skip
+    """How many of samples start … stop, placed, lie in cells marked with their normals' directions, in Wald's test.
 
-    1 if it does, 0 if not, -1 if it faces none of the scanner positions `origins` (K, 3) and so cannot tell (K > 0).
+        samples : (N, 6) float32 points and normals
+        least : (T+1,) fewer hits after k samples end the test; no more than T are tested
+        origins : (K, 3) scanner positions: samples that face none are passed over, since they cannot tell (K > 0)
+    Returns hits, and how many samples were tested: -1 where the test ended it. One call for all: with as many arrays a
+    call for each sample costs as much as the look-up.
     """
-    px, py, pz = float(samples[at, 0]), float(samples[at, 1]), float(samples[at, 2])
-    nx, ny, nz = float(samples[at, 3]), float(samples[at, 4]), float(samples[at, 5])
     r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
     r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
     r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
-    x = r00 * px + r01 * py + r02 * pz + translation[0]
-    y = r10 * px + r11 * py + r12 * pz + translation[1]
-    z = r20 * px + r21 * py + r22 * pz + translation[2]
-    ux, uy, uz = r00 * nx + r01 * ny + r02 * nz, r10 * nx + r11 * ny + r12 * nz, r20 * nx + r21 * ny + r22 * nz
-    facing = origins.shape[0] == 0
-    for k in range(origins.shape[0]):
-        if ux * (origins[k, 0] - x) + uy * (origins[k, 1] - y) + uz * (origins[k, 2] - z) > 0.0:
-            facing = True
+    t0, t1, t2 = translation[0], translation[1], translation[2]
+    hits = tested = 0
+    last = least.shape[0] - 1
+    for at in range(start, stop):
+        px, py, pz = float(samples[at, 0]), float(samples[at, 1]), float(samples[at, 2])
+        nx, ny, nz = float(samples[at, 3]), float(samples[at, 4]), float(samples[at, 5])
+        x = r00 * px + r01 * py + r02 * pz + t0
+        y = r10 * px + r11 * py + r12 * pz + t1
+        z = r20 * px + r21 * py + r22 * pz + t2
+        ux, uy, uz = r00 * nx + r01 * ny + r02 * nz, r10 * nx + r11 * ny + r12 * nz, r20 * nx + r21 * ny + r22 * nz
+        facing = origins.shape[0] == 0
+        for k in range(origins.shape[0]):
+            if ux * (origins[k, 0] - x) + uy * (origins[k, 1] - y) + uz * (origins[k, 2] - z) > 0.0:
+                facing = True
+                break
+        if not facing:
+            continue
+        tested += 1
+        cx, cy, cz = np.int64(floor(x * inverse)), np.int64(floor(y * inverse)), np.int64(floor(z * inverse))
+        block = find_block(hash_keys, hash_values, pack_block(cx >> 3, cy >> 3, cz >> 3))
+        if block >= 0:
+            local = ((cx & 7) << 6) | ((cy & 7) << 3) | (cz & 7)
+            # Most samples of a wrong pose end here, in bits that fit the cache; the masks, 64 times as large, do not.
+            marked = (occupied[block, local >> 6] >> np.uint64(local & 63)) & np.uint64(1)
+            if marked and (masks[block, local] & normal_bit(ux, uy, uz)) != np.uint64(0):
+                hits += 1
+        if hits < least[tested]:
+            return hits, -1
+        if tested == last:
             break
-    if not facing:
-        return -1
-    cx, cy, cz = np.int64(floor(x * inverse)), np.int64(floor(y * inverse)), np.int64(floor(z * inverse))
-    block = find_block(hash_keys, hash_values, pack_block(cx >> 3, cy >> 3, cz >> 3))
-    if block < 0:
-        return 0
-    local = ((cx & 7) << 6) | ((cy & 7) << 3) | (cz & 7)
-    # Most samples of a wrong pose end here, in bits that fit the cache; the masks, 64 times as large, do not.
-    if not (occupied[block, local >> 6] >> np.uint64(local & 63)) & np.uint64(1):
-        return 0
-    return 1 if (masks[block, local] & normal_bit(ux, uy, uz)) != np.uint64(0) else 0
+    return hits, tested
 
 
 @kernel
@@ -276,21 +291,11 @@ def test_pairs(
             place_pair(m1, a1, m2, a2, s1, b1, s2, b2, length, rotation, translation)
             if not may_be(allowed, which, rotation, translation):
                 continue
-            hits = tested = 0
-            for t in range(n):
-                found = lies_on_scene(
-                    samples, base + t, rotation, translation, origins, inverse, hash_keys, hash_values, occupied, masks
-                )  # fmt: skip
-                if found < 0:
-                    continue
-                hits += found
-                tested += 1
-                if hits < least_hits[tested]:
-                    tested = 0
-                    break
-                if tested == last:
-                    break
-            if tested == 0 or hits < least_hits[last] * tested / last:
+            hits, tested = lie_on_scene(
+                samples, base, base + n, least_hits, rotation, translation, origins, inverse, hash_keys, hash_values,
+                occupied, masks,
+            )  # fmt: skip
+            if tested <= 0 or hits < least_hits[last] * tested / last:
                 continue
             if which == so_far and hits / tested <= best:
                 continue

@@ -62,7 +62,7 @@ class Recognition:
         self.search = Search(
             scene, models, table, ground.arrays, parameters.search, seed, jobs, learnt, parameters.priors
         )
-        self.weighing = Weighing(ground, self.search.telling(), asked.shadows if asked else None)
+        self.weighing = Weighing(ground, self.search.pool.telling(), asked.shadows if asked else None)
         self.fitting = Fitting(ground, self.weighing)
         view = View(scene, self.weighing.fine, self.weighing.thin, ground.signed, parameters.verify)
         assemblies = Assemblies(models, view, parameters.assembly, ground.blind)

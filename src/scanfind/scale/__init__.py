@@ -161,7 +161,7 @@ def weighed(search: Recognition, fits: Sequence[tuple[Model, Similarity]]) -> li
     scene, parameters = search.ground.scene, search.ground.parameters
     models = [sized(model, 1.0 / fit.scale) for model, fit in fits]
     ground = Ground(scene, models, model_arrays(models), parameters, search.ground.jobs)
-    weighing = Weighing(ground, search.search.telling(), None)
+    weighing = Weighing(ground, search.search.pool.telling(), None)
     poses = Hypotheses(
         np.arange(len(fits)), np.array([fit.pose.rotation for _, fit in fits]),
         np.array([fit.pose.translation / fit.scale for _, fit in fits]), np.ones(len(fits)),

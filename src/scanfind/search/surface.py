@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.cloud import OrientedCloud
 from scanfind.errors import require
-from scanfind.grid.scene import flatness_above
 from scanfind.library.pairs import rungs_of
 from scanfind.priors import Priors
 from scanfind.priors.allowed import NOTHING_KNOWN, allowed_poses
 from scanfind.search.draws import Draws, Trial, affordable, wald_table
 from scanfind.search.hypotheses import Hypotheses, no_hypotheses
+from scanfind.search.pool import Pool
 
 if TYPE_CHECKING:
     from scanfind.grid.scene import Scene
@@ -29,8 +28,6 @@ Floats = NDArray[np.float64]
 
 # What was found first was easier to find than what was not: its rate is halved before it is asked of others.
 LEARNT = 0.5
-# Cells drawn from: fewer make pairs that repeat each other, more cost more to fit than they add to a round's pairs.
-LEAST_POOL, MOST_POOL = 20_000, 60_000
 ROUNDS_A_POOL = 4  # draw from mostly the same cells, which are fitted then; small parts need others in the long run
 # The first round tells how easily an instance is found, and often finds all there is. Rounds after it: a little more
 # than is missing, and enough to be worth refining; rather a little more in one round than two.
@@ -44,20 +41,13 @@ FACING_ORIGINS = 6
 # Of the samples that show, so many lie on the scene under a right hypothesis: noise turns normals and moves it. Asked
 # for all of λs, the test refused every right pose of twelve parts that showed 30 %; asked for this, none.
 MEETS = 0.67
-SHAPED = 1000  # samples whose shape tells that of a model, each against all of them
-# Borders between classes of bend, in shares of the window: range noise of 2 mm on a plane is below the first for
-# windows over 0.1 m, a pipe as wide as the window above the last.
-BEND_BORDERS = (0.02, 0.05, 0.1)
 # A pair that lies on an instance finds it when noise left its feature in the right cell of the hash table and one of
 # the model's pairs there is near enough: measured 0.5 on spools, 0.05 – 0.4 on frames, far less on sparse ones. Only
 # until an instance is found; then it is counted (Search.learn).
-RIGHT_PAIR_FINDS = 0.006
+RIGHT_PAIR_FINDS = 0.02
 # Where nothing at all is found, an instance is looked for that shows only half of λs, the paper's own 0.15, for so many
 # full rounds. Of parts that lost 60 to 70 % of their points every one that was found then was found in the first.
 DEEPER, DEEPER_ROUNDS = 0.5, 2.0
-# A surfel's normal counts as clean below so much of a cell, noise apart; but never fewer than this share of a shape's.
-# Drawing only those doubled the right poses a round finds, on spools and frames.
-CLEAN_CELLS, CLEAN_SHARE = 0.1, 0.3
 
 
 @dataclass(frozen=True)
@@ -94,7 +84,7 @@ class SearchParameters:
     time_limit_s: float | None = 60.0
     miss_probability: float = 0.01
     max_instances: int | None = None
-    pairs_a_round: int = 100_000
+    pairs_a_round: int = 40_000
     hypotheses_a_round: int = 200_000
     facing_only: bool = True
     by_shape: bool = True
@@ -151,18 +141,13 @@ class Search:
         self.parameters, self.seed, self.jobs = parameters, seed, jobs
         self.pairs = models[0].parameters.pairs
         self.rungs = sorted({rung for m in models for rung in rungs_of(m.diameter, m.parameters.pairs)}, reverse=True)
-        window = 3.0 * scene.around.cell
-        self._classes = shape_classes(flatness_above(scene.fine, 2, scene.around), window)
-        self._free = np.ones(len(scene.fine.cells), np.bool_)
         known = parameters.facing_only and scene.fine.signed and len(scene.depths) <= FACING_ORIGINS
         self._origins = scene.origins() if known else np.empty((0, 3))
-        self.model_shapes = np.array([model_shape(model, window) for model in models])
         # As far as two samples of a model may be off, but never less than the scene's own resampling.
         self._tolerance = max(scene.fine.cell, self.pairs.tolerance * min(model.spacing for model in models))
-        self._signed = scene.fine.signed and all(model.signed for model in models)
         self.rounds, self.effort, self._last_share = 0, 0.0, 1.0
-        self.pool = np.empty(0, np.intp)
-        self._fill_pool()
+        self.pool = Pool(scene, models, by_shape=parameters.by_shape, seed=seed, jobs=jobs)
+        self._draws = self._draws_of_pool()
         self._finds = np.maximum(RIGHT_PAIR_FINDS, learnt or 0.0)
         self._right, self._last_right = np.zeros(len(models)), np.zeros(len(models))
         self._served = np.zeros(len(models), np.bool_)  # models of which no further instance is wanted
@@ -192,62 +177,11 @@ class Search:
 
     def withdraw(self, cells: NDArray[np.bool_]) -> None:
         """Draw no more from these cells (V,): they are explained."""
-        self._free &= ~cells
-        self._stale = True
+        self.pool.withdraw(cells)
 
-    def _fill_pool(self) -> None:
-        """Choose the surfels that may be drawn: each cell's with a chance by the likelihood ratio of its shape."""
-        counts = self._counts(self._classes[self._free])
-        kept = self._likelihood(counts)
-        kept = kept * min(1.0, MOST_POOL / max(float(kept @ counts), 1.0))
-        # Where the telling cells are few, the others fill up: they may be all there is to draw from.
-        while 0 < np.minimum(kept, 1.0) @ counts < min(LEAST_POOL, 0.9 * counts.sum()):
-            kept = kept * 1.25
-        self._kept = np.minimum(kept, 1.0)
-        luck = np.random.default_rng([self.seed, self.rounds // ROUNDS_A_POOL]).random(len(self._classes), np.float32)
-        chance = self._kept.astype(np.float32)[self._classes]
-        fine = self.scene.fine
-        surfels = fine.of(np.flatnonzero(self._free & (luck < chance)))
-        surfels = surfels[fine.has_normal()[surfels]]
-        self.pool = surfels[self._clean(surfels)]
-        self._stale = False
-        points = OrientedCloud(fine.means[self.pool], fine.normals[self.pool], self._signed)
-        self._draws = Draws(points, self.pairs, self.rungs, self._tolerance, self.jobs)
-
-    def _clean(self, surfels: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Which surfels have a normal to rely on: flat but for noise, or among the flatter ones of their shape.
-
-        Across an edge a normal is of neither face, and near edges is where most of the telling surfels are.
-        """
-        fine, classes = self.scene.fine, self._classes[self.scene.fine.cell_of[surfels]]
-        flatness = fine.flatness[surfels]
-        clean: NDArray[np.bool_] = flatness <= np.hypot(self.scene.noise, CLEAN_CELLS * fine.cell)
-        for shape in np.unique(classes):
-            alike = classes == shape
-            clean[alike] |= flatness[alike] <= np.quantile(flatness[alike], CLEAN_SHARE)
-        return clean
-
-    def telling(self) -> tuple[Floats, Floats]:
-        """How much the surfels of each fine and of each coarse cell tell, (V,), 0 … 1: the root of the likelihood ratio
-        of their shape, model against scene.
-
-        A plate flush with a floor lies on the scene with all of its samples, and that means nothing.
-        """
-        # What is absent tells as much as what is rare: a bare floor, or a tile of one, tells nothing.
-        scene, tells = self.scene, np.sqrt(self._likelihood(np.maximum(self._counts(self._classes), 1)))
-        coarse = shape_classes(flatness_above(scene.coarse, 1, scene.around), 3.0 * scene.around.cell)
-        return tells[self._classes], tells[coarse]
-
-    def _counts(self, classes: NDArray[np.int8]) -> NDArray[np.intp]:
-        """Of C classes of shape, how many of some cells are in each, (C,); classes : of these cells."""
-        return np.bincount(classes, minlength=len(BEND_BORDERS) + 1)
-
-    def _likelihood(self, counts: NDArray[np.intp]) -> Floats:
-        """Of C classes of shape that so many cells are in, the likelihood ratio of each over the largest, (C,)."""
-        if not self.parameters.by_shape:
-            return np.ones(len(counts))
-        ratio = np.where(counts > 0, self.model_shapes.mean(axis=0) / np.maximum(counts, 1), 0.0)
-        return np.asarray(ratio / max(ratio.max(), 1e-300))
+    def _draws_of_pool(self) -> Draws:
+        """The pool as it is now, to be drawn from."""
+        return Draws(self.pool.points(), self.pairs, self.rungs, self._tolerance, self.jobs)
 
     def may_stop(self) -> bool:
         """Is nothing left to draw from, or the chance to have missed an instance of any model below the one allowed?"""
@@ -257,7 +191,7 @@ class Search:
 
     def pool_left(self) -> bool:
         """Is there a pair left to draw?"""
-        return len(self.pool) > 1 and bool(np.count_nonzero(self._free) > 1)
+        return self.pool.left()
 
     def chance_missed(self) -> float:
         """Chance to have missed an instance that shows λs of its surface, for the model worst served so far."""
@@ -293,8 +227,8 @@ class Search:
 
     def round(self) -> Hypotheses:
         """One round: draw pairs, look them up, test their hypotheses; the best of each pair and model, best first."""
-        if self._stale:
-            self._fill_pool()
+        if self.pool.refilled(self.rounds // ROUNDS_A_POOL):
+            self._draws = self._draws_of_pool()
         if len(self.pool) < 2:
             return no_hypotheses()
         limits, share = self.parameters, self._share()
@@ -323,15 +257,14 @@ class Search:
 
         drawn_here : pairs at each rung; drawn, tested : keys of those that met a second point, and of those tested
         """
-        cells, fine, shown = len(self.table.offsets) - 1, self.scene.fine, self.parameters.overlap_ratio
+        cells, shown = len(self.table.offsets) - 1, self.parameters.overlap_ratio
         self._last_right[:] = 0.0
         count = np.bincount(drawn, minlength=cells)
         # None of a feature that was not drawn was left out: without this a scan too small for a pair is never done.
         share = np.where(count > 0, np.bincount(tested, minlength=cells) / np.maximum(count, 1), 1.0)
         for number, model in enumerate(self.models):
             samples, rung_of_pair = len(model.samples), model.pairs.keys // self.pairs.cells_per_rung()
-            # What of an instance that shows λs of its surface would be in the pool.
-            on_it = shown * model.area / fine.cell**2 * float((self.model_shapes[number] * self._kept).sum())
+            on_it = shown * self.pool.on(number)
             first_on_it = min(1.0, on_it / max(len(self.pool), 1))
             for rung in rungs_of(model.diameter, model.parameters.pairs):
                 keys = model.pairs.keys[rung_of_pair == rung]
@@ -343,19 +276,3 @@ class Search:
                 second_on_it = partners / max(self._draws.partners(rung), partners, 1e-9)
                 self._last_right[number] += drawn_here * first_on_it * second_on_it * float(share[keys].mean())
         self._right += self._last_right
-
-
-def shape_classes(bends: NDArray[np.floating], window: float) -> NDArray[np.int8]:
-    """Class of each point by how bent the surface around it is, (N,); bends : (N,), window : both metres."""
-    return np.asarray(np.digitize(bends, np.array(BEND_BORDERS) * window), np.int8)
-
-
-def model_shape(model: Model, window: float) -> Floats:
-    """Share of a model's samples in each class, (C,); none is quite zero: scan and model are not sampled alike."""
-    from scanfind.kernels.shape import bend_of_samples
-
-    # The first ones lie as evenly over the model as all of them.
-    bends = np.empty(min(len(model.samples), SHAPED))
-    bend_of_samples(model.samples.points, model.samples.normals, window, bends)
-    shares = np.bincount(shape_classes(bends, window), minlength=len(BEND_BORDERS) + 1) / len(bends)
-    return np.asarray((shares + 0.02) / (shares + 0.02).sum())
