@@ -16,7 +16,7 @@ LINE_SEEDS ?= 7400-7411
 QUICK ?= paper-quick
 SOURCES := $(shell find src -name '*.py')
 # An index out of bounds corrupts silently in compiled code: these run once with every access checked.
-KERNEL_TESTS := $(wildcard $(foreach stage,near_surface isolate surface pairs surfels search verify refine scene onto_itself,\
+KERNEL_TESTS := $(wildcard $(foreach stage,near_surface isolate surface pairs surfels pool search verify refine scene onto_itself,\
 	tests/test_$(stage)*.py))
 
 # What neither starts a child process for each model nor compiles the search.

@@ -23,6 +23,8 @@ HEAVIER_RIM, HEAVIER_PLATE = 1.22, 1.75
 # By how much twins that differ in a length do: less than a flange's width, ten times the noise and more.
 TWIN_BRANCH_M, TWIN_RISE_M, TWIN_CROSS_M = 0.12, 0.1, 0.15
 HALF_TURN = np.pi
+# By how much the library's flanges are wider than those that stand about: half a size.
+FLANGE_BESIDE_M = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +224,11 @@ def design_of(number: int) -> SpoolDesign:
 
 @cache
 def hundred() -> tuple[Part, ...]:
-    """A library of 100: 8 spools and 5 frames with their twins, 10 valves and 10 flanges of two kinds each."""
+    """A library of 100: 8 spools and 5 frames with their twins, 10 valves and 10 flanges of two kinds each.
+
+    No flange is of the size of those on the spools that stand about in a shop: where one was, it was found on each of
+    these, and rightly.
+    """
     parts: list[Part] = []
     for k in range(8):
         parts += [Part.of(mesh) for mesh in spool_and_twins(f"spool_{k}", design_of(k)).values()]
@@ -232,9 +238,10 @@ def hundred() -> tuple[Part, ...]:
     for k in range(10):
         radius = 0.1 + 0.01 * k
         parts += [gate_valve(f"valve_{k}", radius), gate_valve(f"valve_{k}_geared", radius, geared=True)]
-        rim, plate = FLANGE_OVER_PIPE * radius, flange_thickness(radius)
-        parts.append(weld_neck(f"flange_{k}", radius, rim, plate))
-        parts.append(weld_neck(f"flange_{k}_heavier", radius, HEAVIER_RIM * rim, HEAVIER_PLATE * plate))
+        neck = radius + FLANGE_BESIDE_M
+        rim, plate = FLANGE_OVER_PIPE * neck, flange_thickness(neck)
+        parts.append(weld_neck(f"flange_{k}", neck, rim, plate))
+        parts.append(weld_neck(f"flange_{k}_heavier", neck, HEAVIER_RIM * rim, HEAVIER_PLATE * plate))
     return tuple(parts)
 
 

@@ -46,6 +46,7 @@ SHAPED = 500  # samples that tell that share
 MARKED_CELLS = 2.0  # edge of the test's cells; a line supports samples half of one beside it
 # Lines are looked for of instances that show so much of themselves; of a wrong pose's lines 0.05 lie on the scene's.
 SHOWN, CHANCE = 0.15, 0.05
+MORE_PAIRS = 2.5  # are drawn than in a round of surface: there is one round, and lines are few
 LINES = 1000  # of a model, at most: as evenly spread over it as all of its samples
 PLACED = 300  # poses with one line of the model laid along one of the scene's: what chance alone puts on lines
 
@@ -120,8 +121,9 @@ class _Window:
             return no_hypotheses()
         limits = self._parameters
         drawn = self._draws.draw(
-            round(limits.pairs_a_round / len(self._draws.rungs)), self._seed, self._rounds, limits.max_tries
-        )
+            round(MORE_PAIRS * limits.pairs_a_round / len(self._draws.rungs)), self._seed, self._rounds,
+            limits.max_tries,
+        )  # fmt: skip
         self._rounds += 1
         tested = affordable(drawn, self._trial.table, limits.hypotheses_a_round, rarest_first=limits.telling_first)
         found = self._trial.test(tested, self._lines, self._jobs)
