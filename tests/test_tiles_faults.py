@@ -170,9 +170,11 @@ def undisturbed(setups: Path, tmp_path_factory: pytest.TempPathFactory) -> list[
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_an_interrupted_run_goes_on(setups: Path, undisturbed: list[Any], tmp_path: Path, how: signal.Signals) -> None:
     out, work = tmp_path / "found", tmp_path / "found.scanfind-work"
-    with subprocess.Popen(
-        [sys.executable, "-m", "scanfind", *command(setups, out)], stderr=subprocess.PIPE, text=True
-    ) as run:
+    # What a shell runs in the background ignores SIGINT, and so would its children.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    run = subprocess.Popen([sys.executable, "-m", "scanfind", *command(setups, out)], stderr=subprocess.PIPE, text=True)
+    signal.signal(signal.SIGINT, before)
+    with run:
         until((work / "scan-00002" / "done").exists)
         run.send_signal(how)
         said = run.communicate()[1]

@@ -28,10 +28,10 @@ Floats = NDArray[np.float64]
 
 # What was found first was easier to find than what was not: its rate is halved before it is asked of others.
 LEARNT = 0.5
-ROUNDS_A_POOL = 4  # draw from mostly the same cells, which are fitted then; small parts need others in the long run
+ROUNDS_A_POOL = 2  # draw from mostly the same cells, which are fitted then; small parts need others in the long run
 # The first round tells how easily an instance is found, and often finds all there is. Rounds after it: a little more
 # than is missing, and enough to be worth refining; rather a little more in one round than two.
-FIRST_ROUND, ROUND_MARGIN, LEAST_ROUND, MOST_ROUND = 0.3, 1.1, 0.15, 1.3
+FIRST_ROUND, ROUND_MARGIN, LEAST_ROUND, MOST_ROUND = 0.3, 1.1, 0.15, 3.0
 # A round can afford so many models: of more, each has its share. With 200,000 hypotheses for 40 spools only pairs were
 # tested whose feature was drawn once or twice, which is mostly noise: of a spool found alone in its first round not one
 # right hypothesis in five rounds.
