@@ -42,8 +42,8 @@ FACING_ORIGINS = 6
 # for all of λs, the test refused every right pose of twelve parts that showed 30 %; asked for this, none.
 MEETS = 0.67
 # A pair foreseen to lie on an instance finds it when it does lie there, noise left its feature in the right cell of the
-# hash table, and one of the model's pairs there is near enough: measured 0.03 – 0.5 on spools, 0.013 – 0.06 on frames.
-# Only until an instance is found; then it is counted (Search.learn).
+# hash table, and one of the model's pairs there is near enough: measured 0.03 – 0.5 on spools, 0.013 – 0.06 on frames,
+# less where two thirds are hidden. Only until an instance is found; then it is counted (Search.learn).
 RIGHT_PAIR_FINDS = 0.02
 # Where nothing at all is found, an instance is looked for that shows only half of λs, the paper's own 0.15, for so many
 # full rounds. Of parts that lost 60 to 70 % of their points every one that was found then was found in the first.
