@@ -17,7 +17,7 @@ from scanfind.grid.surfels import Surfels
 from scanfind.kernels.blocks import find_block, pack_block
 from scanfind.kernels.search import draw_firsts, draw_seconds, normal_bit
 from scanfind.library.self_similar import cube_turns
-from scanfind.search.draws import bin_pool, wald_table
+from scanfind.search.draws import BINS_A_DISTANCE, bin_pool, wald_table
 from scanfind.threads import in_threads
 
 Floats = NDArray[np.float64]
@@ -102,7 +102,7 @@ def test_nothing_at_the_distance_is_said(surfels: Surfels) -> None:
 
 def test_the_pool_s_bins_hold_each_surfel_once(surfels: Surfels) -> None:
     pool = np.arange(0, len(surfels.means), 3)
-    bins = bin_pool(pool, surfels.means, 1.2, TOLERANCE)  # six bins of 0.2 m a distance
+    bins = bin_pool(pool, surfels.means, 0.2 * BINS_A_DISTANCE, TOLERANCE)
     np.testing.assert_array_equal(np.sort(bins.pool), pool)
     assert bins.starts[0] == 0
     assert bins.starts[-1] == len(pool)

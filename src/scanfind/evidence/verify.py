@@ -301,9 +301,9 @@ def held_against(
         lambda start, stop: gather_evidence(
             start, stop, hypotheses.models, arrays.starts, arrays.points, arrays.normals, level.samples,
             hypotheses.rotations, hypotheses.translations, parameters.gate_cells * cell, level.inlier,
-            parameters.normal_agreement, signed, cell, cells.hash_keys, cells.hash_values, cells.block_rows,
-            surfels.first_surfel, surfels.sides, surfels.means, surfels.normals, origins, ranges, edge, margin,
-            parameters.least_facing, ends - sizes, states, residuals, claims,
+            parameters.normal_agreement, signed, cell, cells.hash_keys, cells.hash_values, cells.filled,
+            cells.block_rows, surfels.first_surfel, surfels.sides, surfels.means, surfels.normals, origins, ranges,
+            edge, margin, parameters.least_facing, ends - sizes, states, residuals, claims,
         ),
     )  # fmt: skip
     return Held(ends, states, residuals, claims)

@@ -93,7 +93,7 @@ def icp(
         lambda start, stop: refine_poses(
             start, stop, hypotheses.models, arrays.starts, arrays.points, arrays.normals, arrays.centres, arrays.radii,
             most_samples, gates, normal_agreement, signed, cells.cell, cells.hash_keys, cells.hash_values,
-            cells.block_rows, surfels.first_surfel, surfels.sides, surfels.means, surfels.normals,
+            cells.filled, cells.block_rows, surfels.first_surfel, surfels.sides, surfels.means, surfels.normals,
             rotations, translations, hessians, matched, rms,
         ),
     )  # fmt: skip

@@ -27,6 +27,7 @@ class Cells(NamedTuple):
     offset : (3,) the grid's origin in the scan's frame; everything else is relative to it
     hash_keys, hash_values : packed block coordinates → block
     block_keys : packed; block_rows : (…, 512) int32, the row of each cell, -1 for an empty one
+    filled : (…, 8) uint64, a bit for each cell that is not empty, eight words of eight by eight
     order : (B,) where the blocks lie in these, by key; first_cell : (B+1,) where the cells of each begin
     locals : (V,) int16, each cell's place in its block; rows : (V,) int32, its row
     """
@@ -37,6 +38,7 @@ class Cells(NamedTuple):
     hash_values: NDArray[np.int32]
     block_keys: Ints
     block_rows: NDArray[np.int32]
+    filled: NDArray[np.uint64]
     order: NDArray[np.intp]
     first_cell: Ints
     locals: NDArray[np.int16]
@@ -153,10 +155,12 @@ def number(grid: MomentGrid, jobs: int) -> Cells:
     in_threads(jobs, len(order), lambda start, stop: count_cells(start, stop, order, block_rows, counts))
     first_cell = np.concatenate([[0], np.cumsum(counts)])
     places, rows = np.empty(first_cell[-1], np.int16), np.empty(first_cell[-1], np.int32)
+    filled = np.zeros((len(block_rows), 8), np.uint64)
     in_threads(
-        jobs, len(order), lambda start, stop: number_cells(start, stop, order, block_rows, first_cell, places, rows)
+        jobs, len(order),
+        lambda start, stop: number_cells(start, stop, order, block_rows, first_cell, places, rows, filled),
     )  # fmt: skip
     offset = np.zeros(3) if grid.offset is None else grid.offset
     return Cells(
-        grid.cell, offset, hash_keys, hash_values, block_keys, block_rows, order, first_cell, places, rows
+        grid.cell, offset, hash_keys, hash_values, block_keys, block_rows, filled, order, first_cell, places, rows
     )  # fmt: skip

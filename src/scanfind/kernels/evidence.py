@@ -17,9 +17,8 @@ NO_EVIDENCE, SUPPORTED, SEEN_THROUGH, HIDDEN, SILENT = 0, 1, 2, 3, 4
 @kernel
 def gather_evidence(
     start, stop, models, model_starts, model_points, model_normals, most_points, rotations, translations,
-    gate, inlier, least_cosine, signed, cell, hash_keys, hash_values, block_rows, first_surfel, sides, means, normals,
-    origins, ranges, edge, margin, least_facing,
-    first_sample, states, residuals, claims,
+    gate, inlier, least_cosine, signed, cell, hash_keys, hash_values, filled, block_rows, first_surfel, sides, means,
+    normals, origins, ranges, edge, margin, least_facing, first_sample, states, residuals, claims,
 ):  # fmt: skip
     """Gather the evidence of poses start … stop.
 
@@ -43,7 +42,7 @@ def gather_evidence(
             states[at], residuals[at], claims[at] = NO_EVIDENCE, np.float32(np.nan), -1
             s = nearest_surfel(
                 x, y, z, nx, ny, nz, gate, least_cosine, signed,
-                cell, hash_keys, hash_values, block_rows, first_surfel, sides, means, normals,
+                cell, hash_keys, hash_values, filled, block_rows, first_surfel, sides, means, normals,
             )  # fmt: skip
             if s >= 0:
                 ux, uy, uz = normals[s, 0], normals[s, 1], normals[s, 2]

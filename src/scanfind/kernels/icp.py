@@ -45,7 +45,7 @@ def solve_damped(hessian, gradient, damping, step):
 @kernel
 def refine_poses(
     start, stop, models, model_starts, model_points, model_normals, model_centres, model_radii, most_points,
-    gates, least_cosine, signed, cell, hash_keys, hash_values, block_rows, first_surfel, sides, means, normals,
+    gates, least_cosine, signed, cell, hash_keys, hash_values, filled, block_rows, first_surfel, sides, means, normals,
     rotations, translations, hessians, matched, residuals,
 ):  # fmt: skip
     """Refine poses start … stop in place (paper 3.4: post-ICP), one Gauss–Newton step for each gate.
@@ -80,7 +80,7 @@ def refine_poses(
                 x, y, z, nx, ny, nz = placed(model_points, model_normals, base + t, rotation, translation)
                 s = nearest_surfel(
                     x, y, z, nx, ny, nz, gate, least_cosine, signed,
-                    cell, hash_keys, hash_values, block_rows, first_surfel, sides, means, normals,
+                    cell, hash_keys, hash_values, filled, block_rows, first_surfel, sides, means, normals,
                 )  # fmt: skip
                 if s < 0:
                     continue

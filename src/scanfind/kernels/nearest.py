@@ -9,15 +9,21 @@ import numpy as np
 from scanfind.kernels.blocks import find_block, pack_block
 from scanfind.kernels.jit import kernel
 
+# A sequence in which each six bits come once (Leiserson, Prokop & Randall 1998), and where they come.
+DE_BRUIJN = np.uint64(0x03F79D71B4CB0A89)
+PLACES = np.empty(64, np.int64)
+PLACES[[(int(DE_BRUIJN) << place & (1 << 64) - 1) >> 58 for place in range(64)]] = np.arange(64)
+
 
 @kernel
 def nearest_surfel(
     x, y, z, nx, ny, nz, gate, least_cosine, signed,
-    cell, hash_keys, hash_values, block_rows, first_surfel, sides, means, normals,
+    cell, hash_keys, hash_values, filled, block_rows, first_surfel, sides, means, normals,
 ):  # fmt: skip
     """The nearest surfel within `gate` metres whose normal agrees, -1 where there is none.
 
     least_cosine : of the angle between normals; by magnitude where the scene's normals are not signed
+    filled : (B, 8) uint64, see Cells: most samples of a wrong pose lie in the empty, and end in a word or two
     """
     inverse = 1.0 / cell
     reach = gate * inverse
@@ -25,29 +31,47 @@ def nearest_surfel(
     y0, y1 = np.int64(floor(y * inverse - reach)), np.int64(floor(y * inverse + reach))
     z0, z1 = np.int64(floor(z * inverse - reach)), np.int64(floor(z * inverse + reach))
     best, nearest = np.int64(-1), gate * gate
-    key, block = np.int64(-1), np.int64(-1)
-    for ix in range(x0, x1 + 1):
-        for iy in range(y0, y1 + 1):
-            for iz in range(z0, z1 + 1):
-                here = pack_block(ix >> 3, iy >> 3, iz >> 3)
-                if here != key:
-                    key = here
-                    block = find_block(hash_keys, hash_values, key)
+    for bx in range(x0 >> 3, (x1 >> 3) + 1):
+        for by in range(y0 >> 3, (y1 >> 3) + 1):
+            for bz in range(z0 >> 3, (z1 >> 3) + 1):
+                block = find_block(hash_keys, hash_values, pack_block(bx, by, bz))
                 if block < 0:
                     continue
-                row = block_rows[block, ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7)]
-                if row < 0:
-                    continue
-                for s in range(first_surfel[row], first_surfel[row] + sides[row]):
-                    dx, dy, dz = means[s, 0] - x, means[s, 1] - y, means[s, 2] - z
-                    squared = dx * dx + dy * dy + dz * dz
-                    if squared >= nearest:
-                        continue
-                    cosine = nx * normals[s, 0] + ny * normals[s, 1] + nz * normals[s, 2]
-                    if cosine < least_cosine and (signed or -cosine < least_cosine):
-                        continue
-                    best, nearest = s, squared
+                first_y, last_y = max(y0 - (by << 3), 0), min(y1 - (by << 3), 7)
+                first_z, last_z = max(z0 - (bz << 3), 0), min(z1 - (bz << 3), 7)
+                word = square(first_y, last_y, first_z, last_z)
+                for lx in range(max(x0 - (bx << 3), 0), min(x1 - (bx << 3), 7) + 1):
+                    there = filled[block, lx] & word
+                    while there != 0:
+                        others = there & (there - np.uint64(1))
+                        row = block_rows[block, (lx << 6) | place_of(there ^ others)]
+                        there = others
+                        for s in range(first_surfel[row], first_surfel[row] + sides[row]):
+                            dx, dy, dz = means[s, 0] - x, means[s, 1] - y, means[s, 2] - z
+                            squared = dx * dx + dy * dy + dz * dz
+                            if squared >= nearest:
+                                continue
+                            cosine = nx * normals[s, 0] + ny * normals[s, 1] + nz * normals[s, 2]
+                            if cosine < least_cosine and (signed or -cosine < least_cosine):
+                                continue
+                            best, nearest = s, squared
     return best
+
+
+@kernel
+def place_of(bit):
+    """Which of 64 bits it is that is set: each of them shifts another six bits to the top."""
+    return PLACES[(bit * DE_BRUIJN) >> np.uint64(58)]
+
+
+@kernel
+def square(first_y, last_y, first_z, last_z):
+    """The bits, of the word of one layer of a block, of the cells from first_y … last_y and first_z … last_z."""
+    run = ((np.uint64(1) << np.uint64(last_z - first_z + 1)) - np.uint64(1)) << np.uint64(first_z)
+    word = np.uint64(0)
+    for ly in range(first_y, last_y + 1):
+        word |= run << np.uint64(8 * ly)
+    return word
 
 
 @kernel
@@ -70,11 +94,10 @@ def mark_around(points, reach, cell, hash_keys, hash_values, layers):
                     block = find_block(hash_keys, hash_values, pack_block(bx, by, bz))
                     if block < 0:
                         continue
-                    z0, z1 = max(z - reach - (bz << 3), 0), min(z + reach - (bz << 3), 7)
-                    run = ((np.uint64(1) << np.uint64(z1 - z0 + 1)) - np.uint64(1)) << np.uint64(z0)
-                    word = np.uint64(0)
-                    for ly in range(max(y - reach - (by << 3), 0), min(y + reach - (by << 3), 7) + 1):
-                        word |= run << np.uint64(8 * ly)
+                    word = square(
+                        max(y - reach - (by << 3), 0), min(y + reach - (by << 3), 7),
+                        max(z - reach - (bz << 3), 0), min(z + reach - (bz << 3), 7),
+                    )  # fmt: skip
                     for lx in range(max(x - reach - (bx << 3), 0), min(x + reach - (bx << 3), 7) + 1):
                         layers[block, lx] |= word
 

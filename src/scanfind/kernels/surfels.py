@@ -57,14 +57,17 @@ def count_cells(start, stop, order, block_rows, counts):
 
 
 @kernel
-def number_cells(start, stop, order, block_rows, first_cell, cell_locals, cell_rows):
-    """Note the place and the row of each cell of blocks order[start:stop], block `k` of them from first_cell[k] on."""
+def number_cells(start, stop, order, block_rows, first_cell, cell_locals, cell_rows, filled):
+    """Note the place and the row of each cell of blocks order[start:stop], block `k` of them from first_cell[k] on, and
+    its bit in filled (B, 8).
+    """
     for block in range(start, stop):
         cell = first_cell[block]
         for local in range(512):
             row = block_rows[order[block], local]
             if row >= 0:
                 cell_locals[cell], cell_rows[cell] = local, row
+                filled[order[block], local >> 6] |= np.uint64(1) << np.uint64(local & 63)
                 cell += 1
 
 

@@ -13,7 +13,8 @@ from scanfind.fit.polish import polish
 from scanfind.fit.refine import Refined, icp, shrinking
 from scanfind.library.near_surface import near_model
 from scanfind.pose import Pose
-from scanfind.search.hypotheses import joined
+from scanfind.search.hypotheses import joined, no_hypotheses
+from scanfind.threads import in_threads
 
 if TYPE_CHECKING:
     from scanfind.grid.surfels import Surfels
@@ -26,7 +27,7 @@ Floats = NDArray[np.float64]
 
 LOOKED_AT = 8  # poses of each model a round, whatever the coarse surfels say of them
 MOST_AT_ONCE = 192  # poses of all models fitted to coarse surfels together; half as many to fine ones
-BATCHES = 3  # of hypotheses refined a round, each far from where those before it went
+BATCHES = 2  # of hypotheses refined a round, each far from where those before it went; of 80 instances none came of a third
 DRIFT_CELLS = 3  # of a gate of one cell, and two that a pose may still move after the coarse steps
 ON_BEAMS_CELLS, ON_BEAMS_STEPS = 1.5, 2  # how near the surface beams end that a pose is fitted to, and how often
 
@@ -45,9 +46,13 @@ class Fitting:
         self._the_same = diameters / 1000.0
         self.drawn_in = diameters / 10.0
         self._near: dict[int, NearSurface] = {}
+        self._refuted = no_hypotheses()
 
     def refine(self, hypotheses: Hypotheses) -> Refined:
-        """ICP of what is distinct among the hypotheses on the coarse surfels; of what these do not refute, the fine."""
+        """ICP of what is distinct among the hypotheses on the coarse surfels; of what these do not refute, the fine.
+
+        What an earlier round brought to the same place was weighed there, and is not fitted again: see `look_again`.
+        """
         kept, met = self._ground.parameters.search.kept, None
         # One good instance passes the test hundreds of times: those poses must not use up the place of the others.
         apart = distinct(hypotheses, self._ground.arrays, self._apart_before)
@@ -60,17 +65,25 @@ class Fitting:
                 break
             rough.append(self.coarse(batch))
             met = joined([r.hypotheses for r in rough])
-            hypotheses = hypotheses.take(self._far_from(hypotheses, met))
+            # Nor those that would be drawn to where these went already.
+            hypotheses = hypotheses.take(self._far_from(hypotheses, met, self.drawn_in))
         if met is None:
             return self.fine(hypotheses)
         better = self._weighing.best_fitted(met)
         better = better.take(distinct(better, self._ground.arrays, self.apart, kept, MOST_AT_ONCE // 2))
-        fine = self.fine(better.take(self._weighing.promising(better, LOOKED_AT)))
+        better = better.take(self._weighing.promising(better, LOOKED_AT))
+        better = better.take(self._far_from(better, self._refuted, self._the_same))
+        self._refuted = joined([self._refuted, better])
+        fine = self.fine(better)
         if self._weighing.lines and self._ground.parameters.refine.raw_steps:
             fine = self.on_beams(fine, self._weighing.lines.beyond_chance(fine.hypotheses) > 0.0)
         fine = fine.take(np.argsort(-fine.matched, kind="stable"))
         # What ended at one place is asked once.
         return fine.take(distinct(fine.hypotheses, self._ground.arrays, self._the_same, kept, MOST_AT_ONCE // 2))
+
+    def look_again(self) -> None:
+        """Fit again what rounds so far ended at: what is believed or asked has changed, and it may hold now."""
+        self._refuted = no_hypotheses()
 
     def on_beams(self, refined: Refined, some: NDArray[np.bool_]) -> Refined:
         """Refined poses, some of them (H,) fitted to where beams ended that went towards them.
@@ -78,17 +91,26 @@ class Fitting:
         Where cells are too empty for normals, or a model is thinner than they are, ICP ends within a cell; held against
         the model's own faces the beams themselves bring that to a millimetre, in ten milliseconds.
         """
-        refine = self._ground.parameters.refine
-        found, models, scene = refined.hypotheses, self._ground.models, self._ground.scene
-        for k in np.flatnonzero(some):
-            number = int(found.models[k])
-            pose = Pose(found.rotations[k], found.translations[k])
-            for _ in range(ON_BEAMS_STEPS):
-                ends = towards(models[number], pose, scene.beams).ends()
-                fitted = polish(self.near(number), pose, ends, np.zeros(len(ends), np.int64), refine)
-                pose = fitted.scene_from_model if fitted else pose
-            found.rotations[k], found.translations[k] = pose.rotation, pose.translation
+        found, which = refined.hypotheses, np.flatnonzero(some)
+        for number in np.unique(found.models[which]):
+            self.near(int(number))
+
+        def fit(start: int, stop: int) -> None:
+            for k in which[start:stop]:
+                pose = self._onto_beams(int(found.models[k]), Pose(found.rotations[k], found.translations[k]))
+                found.rotations[k], found.translations[k] = pose.rotation, pose.translation
+
+        in_threads(self._ground.jobs, len(which), fit)
         return refined
+
+    def _onto_beams(self, number: int, pose: Pose) -> Pose:
+        """A pose of a model fitted to where beams ended."""
+        ground, near = self._ground, self.near(number)
+        for _ in range(ON_BEAMS_STEPS):
+            ends = towards(ground.models[number], pose, ground.scene.beams).ends()
+            fitted = polish(near, pose, ends, np.zeros(len(ends), np.int64), ground.parameters.refine)
+            pose = fitted.scene_from_model if fitted else pose
+        return pose
 
     def near(self, model: int) -> NearSurface:
         """The surface of a model, to be asked for distances up to ON_BEAMS_CELLS fine cells."""
@@ -97,14 +119,14 @@ class Fitting:
             self._near[model] = near_model(self._ground.models[model], reach)
         return self._near[model]
 
-    def _far_from(self, hypotheses: Hypotheses, met: Hypotheses) -> NDArray[np.intp]:
-        """The hypotheses that would not be drawn to where those in `met` went already (indices)."""
+    def _far_from(self, hypotheses: Hypotheses, met: Hypotheses, far: Floats) -> NDArray[np.intp]:
+        """The hypotheses so far, metres for each model, (models,), or farther from all those in `met` (indices)."""
         theirs, placed = outlines(met, self._ground.arrays), outlines(hypotheses, self._ground.arrays)
-        far = np.ones(len(placed), np.bool_)
+        kept = np.ones(len(placed), np.bool_)
         for model in np.unique(hypotheses.models):
             mine = hypotheses.models == model
-            far[mine] = nearest(placed[mine], theirs[met.models == model]) >= self.drawn_in[model]
-        return np.flatnonzero(far)
+            kept[mine] = nearest(placed[mine], theirs[met.models == model]) >= far[model]
+        return np.flatnonzero(kept)
 
     def coarse(self, hypotheses: Hypotheses) -> Refined:
         """ICP on the coarse surfels."""

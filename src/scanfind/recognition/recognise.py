@@ -77,6 +77,7 @@ class Recognition:
         self.by_design: list[Candidate] = []
         self._refused: list[tuple[Candidate, str]] = []
         self._ran_out_of_time = False
+        self._of_lines = self._lines_find = False  # the last round was of lines; it found something
         expected = parameters.priors.expected([model.name for model in models])
         self._expected = np.array([expected.get(model.name, 0) for model in models])
         self._wanted = np.where(self._expected > 0, self._expected, np.iinfo(np.int64).max)
@@ -99,7 +100,7 @@ class Recognition:
             return False
         # With less to show than is expected, rather a longer search than an answer that the next seed contradicts.
         short = not self.believed or self._fewer_than_expected()
-        if not self.search.may_stop() or (short and (self._untried() or self.search.look_deeper())):
+        if self._lines_find or not self.search.may_stop() or (short and (self._untried() or self.search.look_deeper())):
             return True
         return self._fewer_than_expected() and limits.time_limit_s is not None and self.search.pool_left()
 
@@ -121,21 +122,35 @@ class Recognition:
         return self.ground.parameters.search.by_lines and self.weighing.lines is None and bool(self._by_lines.any())
 
     def round(self) -> Hypotheses:
-        """Hypotheses of one more round, best first: of pairs of surface; once, for models of which the first round of
-        these found nothing, of lines.
+        """Hypotheses of one more round, best first: of pairs of surface; for models of which the first round of these
+        found nothing, of lines, once and again as long as these find something.
         """
-        if self._untried() and (self.search.rounds or not self.search.pool_left()):
+        self._of_lines = self._lines_find or (
+            self._untried() and bool(self.search.rounds or not self.search.pool_left())
+        )
+        if self._lines_find and self.weighing.lines:
+            return self._elsewhere(self.weighing.lines.round())
+        if self._of_lines:
             ground, wanted = self.ground, self._by_lines & (self._found() == 0)
             lines = LineSearch(
                 ground.scene, self.models, wanted, ground.parameters.search, self._seed, ground.jobs,
                 ground.parameters.priors,
             )  # fmt: skip
             self.weighing.lines = lines
+            self.fitting.look_again()
             if lines:
                 # What was refused for telling too little may be told by its lines.
                 again = [ground.placements(c.model, [c.pose()]) for c, _ in self._refused]
                 return joined([*again, lines.round()])
+            self._of_lines = False
         return self.search.round()
+
+    def _elsewhere(self, hypotheses: Hypotheses) -> Hypotheses:
+        """Those that do not lead to what is believed: lines are drawn from all of it, surface from what is left."""
+        led = np.zeros(len(hypotheses.models), np.bool_)
+        for candidate in self.believed:
+            led |= self._lead_to(hypotheses, candidate)
+        return hypotheses.take(np.flatnonzero(~led))
 
     def at_design(self) -> Iterator[Hypotheses]:
         """The poses the design gives, some of each model at a time; none where none is asked for.
@@ -201,10 +216,15 @@ class Recognition:
                 best = self._best_of_similar(candidate)
                 if best is not candidate and claims.hold(best):
                     continue  # turned over, it is one we have
-                self.search.learn(best.model, self._hits(hypotheses, best), best.evidence.support())
+                hits = self._hits(hypotheses, best)
+                self.search.learn(best.model, hits, best.evidence.support(), by_lines=self._of_lines)
             believed.append(best)
             claims.add(best)
         self.believed = self._shown_alike(believed) if ground.blind else believed
+        changed = {id(candidate) for candidate in self.believed} != settled
+        if changed:
+            self.fitting.look_again()
+        self._lines_find = self._of_lines and changed
         self._settled(claims)
 
     def _settled(self, claims: Claims) -> None:
@@ -226,13 +246,19 @@ class Recognition:
         return alike
 
     def _hits(self, hypotheses: Hypotheses, found: Candidate) -> int:
-        """How many of a round's hypotheses lead to a pose, or to one that looks the same or could be taken for it."""
+        """How many of a round's hypotheses lead to a pose."""
+        return int(np.count_nonzero(self._lead_to(hypotheses, found)))
+
+    def _lead_to(self, hypotheses: Hypotheses, found: Candidate) -> NDArray[np.bool_]:
+        """Which hypotheses lead to a pose, or to one that looks the same or could be taken for it, (H,)."""
         placed, model = found.pose(), self.models[found.model]
+        lead: NDArray[np.bool_] = hypotheses.models == found.model
         motions = [*model.symmetry.motions(), *self._similar(found.model)]
         poses = [placed @ motion for motion in motions]
         theirs = outlines(self.ground.placements(found.model, poses), self.ground.arrays)
-        mine = outlines(hypotheses.take(np.flatnonzero(hypotheses.models == found.model)), self.ground.arrays)
-        return int(np.count_nonzero(nearest(mine, theirs) < self.fitting.drawn_in[found.model]))
+        mine = outlines(hypotheses.take(np.flatnonzero(lead)), self.ground.arrays)
+        lead[lead] = nearest(mine, theirs) < self.fitting.drawn_in[found.model]
+        return lead
 
     def _similar(self, model: int) -> list[Pose]:
         """The motions after which a model could be taken for itself. True symmetries are not tried: nothing tells."""

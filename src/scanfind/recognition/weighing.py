@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import chain
 from math import ceil
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from scanfind.evidence.verify import Evidence, Level, gather_rough, gather_suppo
 from scanfind.pose import Pose
 from scanfind.recognition.candidate import Candidate
 from scanfind.recognition.witnesses import Witnesses
+from scanfind.threads import in_threads
 
 if TYPE_CHECKING:
     from scanfind.evidence.free_space import Design
@@ -80,12 +82,18 @@ class Weighing:
             hypotheses, ground.scene, self.fine, self.thin, ground.arrays, ground.signed, verify, ground.jobs
         )  # fmt: skip
         lines = self.lines.beyond_chance(hypotheses) if self.lines else np.zeros(len(support))
-        found = []
-        for seen, on_lines, number, rotation, translation in zip(support, lines, *hypotheses[:3], strict=True):
-            spoken = self.spoken_of(int(number), Pose(rotation, translation), in_place=in_place)
-            rough = ground.models[number].mesh is None
-            found.append(Evidence(*seen[:-1], spoken, seen.claims, float(on_lines), rough))
-        return found
+        poses = list(zip(*hypotheses[:3], strict=True))
+        spoken = in_threads(
+            ground.jobs, len(poses),
+            lambda start, stop: [
+                self.spoken_of(int(number), Pose(rotation, translation), in_place=in_place)
+                for number, rotation, translation in poses[start:stop]
+            ],
+        )  # fmt: skip
+        return [
+            Evidence(*seen[:-1], said, seen.claims, float(on_lines), ground.models[number].mesh is None)
+            for seen, said, on_lines, number in zip(support, chain(*spoken), lines, hypotheses.models, strict=True)
+        ]
 
     def spoken_of(self, number: int, placed: Pose, *, in_place: bool = False) -> Spoken:
         """What beams say of a model at a pose relative to the grid's offset; in_place : see `candidates`."""

@@ -153,6 +153,7 @@ class Search:
         self._served = np.zeros(len(models), np.bool_)  # models of which no further instance is wanted
         # Of the instances found: hits, and what they showed, in full rounds and in right pairs of one that shows λs.
         self._learned = np.zeros((len(models), 3))
+        self._by_lines = np.zeros((len(models), 2))  # of those found by lines: hits, and what they showed
         self._look_for(parameters.overlap_ratio)
 
     def _look_for(self, overlap_ratio: float) -> None:
@@ -196,6 +197,7 @@ class Search:
     def chance_missed(self) -> float:
         """Chance to have missed an instance that shows λs of its surface, for the model worst served so far."""
         expected = np.where(self._learned[:, 1] > 0.0, self.effort * self._rate(), self._finds * self._right)
+        expected += LEARNT * self._by_lines[:, 0] / np.maximum(self._by_lines[:, 1], 1e-300)
         return exp(-float(expected.min(initial=np.inf, where=~self._served)))
 
     def tally(self) -> Tally:
@@ -215,10 +217,16 @@ class Search:
         needed = self.effort * (log(allowed) / log(missed) - 1.0)
         return min(MOST_ROUND, max(LEAST_ROUND, ROUND_MARGIN * needed))
 
-    def learn(self, model: int, hits: int, support: float) -> None:
-        """Learn from an instance how often the last round hit it: pairs on it go with the square of what it shows."""
+    def learn(self, model: int, hits: int, support: float, *, by_lines: bool = False) -> None:
+        """Learn from an instance how often the last round hit it: pairs on it go with the square of what it shows.
+
+        by_lines : that was a round of lines (see lines), of which there was one: it tells nothing of surface
+        """
         shown = (support / self.parameters.overlap_ratio) ** 2
-        self._learned[model] += max(hits, 1), self._last_share * shown, self._last_right[model] * shown
+        if by_lines:
+            self._by_lines[model] += max(hits, 1), shown
+        else:
+            self._learned[model] += max(hits, 1), self._last_share * shown, self._last_right[model] * shown
         self._look_for(self.parameters.overlap_ratio)  # others are looked for as at first
 
     def _rate(self) -> Floats:
