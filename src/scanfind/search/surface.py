@@ -196,7 +196,8 @@ class Search:
 
     def chance_missed(self) -> float:
         """Chance to have missed an instance that shows λs of its surface, for the model worst served so far."""
-        expected = np.where(self._learned[:, 1] > 0.0, self.effort * self._rate(), self._finds * self._right)
+        # Never less than is believed of a model that nobody saw: nothing is searched longer for having been seen.
+        expected = np.maximum(self.effort * self._rate(), self._finds * self._right)
         expected += LEARNT * self._by_lines[:, 0] / np.maximum(self._by_lines[:, 1], 1e-300)
         return exp(-float(expected.min(initial=np.inf, where=~self._served)))
 
