@@ -14,16 +14,19 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from scanfind.cloud import OrientedCloud, PointChunk
+from scanfind.evidence.verify import nearest, outlines
 from scanfind.find import find
 from scanfind.grid.moments import MomentGrid
 from scanfind.grid.scene import Scene, build_scene
 from scanfind.grid.surfels import number
 from scanfind.kernels.blocks import unpack_block
 from scanfind.kernels.lines import fit_lines, lines_of_samples
+from scanfind.library import joint_table
 from scanfind.library.model import Model, ModelParameters, build_model
 from scanfind.library.surface import SurfaceParameters
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.pose import Pose, random_rotation
+from scanfind.recognition.recognise import Recognition
 from scanfind.search.hypotheses import Hypotheses
 from scanfind.search.lines import LEAST_CELLS, REACH, LineSearch, beside, frames, level_of
 from scanfind.simulate.instruments import Scanner
@@ -195,3 +198,53 @@ def test_three_hundred_points_of_a_frame_and_nothing_else_are_enough() -> None:
     found = find(alone.stations, box_frame(), isolate=False)
     assert len(found) == 1
     assert np.linalg.norm(found[0].scene_from_model.translation - TRUTH.translation) < 0.005
+
+
+# ── what rounds of lines leave behind ──
+
+
+def recognition() -> Recognition:
+    return Recognition(hall_scene(), [frame()], joint_table([frame()]), Parameters(), 0, 1)
+
+
+@pytest.mark.parametrize("by_lines", [True, False])
+def test_what_was_found_makes_no_search_longer_and_lines_tell_nothing_of_surface(by_lines: bool) -> None:
+    search = recognition().search
+    search.round()
+    before, tally = search.chance_missed(), search.tally()
+    assert 0.0 < before < 1.0
+    search.learn(0, 1, 1.0, by_lines=by_lines)  # all of it shown and hit but once: as hard to find as a thing can be
+    assert search.chance_missed() <= before
+    assert (search.tally().hits[0] == 0.0) == by_lines
+    assert (search.tally().shown[0] == 0.0) == by_lines
+    assert search.tally().tested[0] == tally.tested[0]
+    search.learn(0, 50, 0.3, by_lines=by_lines)
+    assert search.chance_missed() < before
+
+
+def test_what_a_round_came_to_is_fitted_again_only_when_asked() -> None:
+    found = recognition()
+    hypotheses = LineSearch(hall_scene(), [frame()], np.ones(1, np.bool_), Parameters().search, 0, 1).round()
+    first = found.refine(hypotheses)
+    assert len(first.rms)
+    assert not len(found.refine(hypotheses).rms)
+    found.fitting.look_again()
+    again = found.refine(hypotheses)
+    np.testing.assert_array_equal(again.hypotheses.translations, first.hypotheses.translations)
+
+
+def test_lines_are_asked_again_until_they_find_nothing_and_lead_to_nothing_known() -> None:
+    found, at = recognition(), Pose(TRUTH.rotation, TRUTH.translation - hall_scene().fine.cells.offset)
+    arrays = found.ground.arrays
+    rounds: list[tuple[int, bool, float]] = []
+    truth = outlines(found.ground.placements(0, [at]), arrays)
+    while found.wants_more(0.0) and len(rounds) < 12:
+        believed, asked = len(found.believed), found.weighing.lines is not None
+        hypotheses = found.round()
+        rounds.append((believed, asked, float(nearest(outlines(hypotheses, arrays), truth).min(initial=np.inf))))
+        found.believe(hypotheses, found.refine(hypotheses))
+    assert len(found.believed) == 1
+    # Of the first round after it was found, which is of lines, nothing leads to it.
+    after = next(off for believed, asked, off in rounds if believed and asked)
+    assert after >= frame().diameter / 10.0
+    assert min(off for _, _, off in rounds) < frame().diameter / 10.0
