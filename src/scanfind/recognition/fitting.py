@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 
 LOOKED_AT = 8  # poses of each model a round, whatever the coarse surfels say of them
 MOST_AT_ONCE = 192  # poses of all models fitted to coarse surfels together; half as many to fine ones
-BATCHES = 2  # of hypotheses refined a round, each far from where those before it went: none in 80 came of a third
+BATCHES = 2  # of hypotheses refined a round, each far from where those before it went: none of 66 came of a third
 DRIFT_CELLS = 3  # of a gate of one cell, and two that a pose may still move after the coarse steps
 # Where lines find so many times what surface does, cells are too empty for normals: of frames of 450 points found by
 # lines 4.7 to 19 times, of those in a plant 2.5, and ICP brought these to a millimetre.

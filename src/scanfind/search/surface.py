@@ -198,7 +198,7 @@ class Search:
         """Chance to have missed an instance that shows λs of its surface, for the model worst served so far."""
         # Never less than is believed of a model that nobody saw: nothing is searched longer for having been seen.
         expected = np.maximum(self.effort * self._rate(), self._finds * self._right)
-        expected += LEARNT * self._by_lines[:, 0] / np.maximum(self._by_lines[:, 1], 1e-300)
+        expected += believed_of_others(*self._by_lines.T)
         return exp(-float(expected.min(initial=np.inf, where=~self._served)))
 
     def tally(self) -> Tally:
@@ -221,7 +221,7 @@ class Search:
     def learn(self, model: int, hits: int, support: float, *, by_lines: bool = False) -> None:
         """Learn from an instance how often the last round hit it: pairs on it go with the square of what it shows.
 
-        by_lines : that was a round of lines (see lines), of which there was one: it tells nothing of surface
+        by_lines : that was a round of lines (see lines), which tells nothing of surface
         """
         shown = (support / self.parameters.overlap_ratio) ** 2
         if by_lines:
@@ -232,7 +232,7 @@ class Search:
 
     def _rate(self) -> Floats:
         """Hits a full round of an instance of each model that shows λs of its surface, from those found, (models,)."""
-        return np.asarray(LEARNT * self._learned[:, 0] / np.maximum(self._learned[:, 1], 1e-300))
+        return believed_of_others(self._learned[:, 0], self._learned[:, 1])
 
     def round(self) -> Hypotheses:
         """One round: draw pairs, look them up, test their hypotheses; the best of each pair and model, best first."""
@@ -285,3 +285,8 @@ class Search:
                 second_on_it = partners / max(self._draws.partners(rung), partners, 1e-9)
                 self._last_right[number] += drawn_here * first_on_it * second_on_it * float(share[keys].mean())
         self._right += self._last_right
+
+
+def believed_of_others(hits: Floats, shown: Floats) -> Floats:
+    """What instances found tell of those that were not: hits for each unit of what was shown, less what was easy."""
+    return np.asarray(LEARNT * hits / np.maximum(shown, 1e-300))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.design.elements import placements_of
-from scanfind.search.surface import LEARNT, RIGHT_PAIR_FINDS, Tally
+from scanfind.search.surface import RIGHT_PAIR_FINDS, Tally, believed_of_others
 from scanfind.tiles.plan import Held, Tile, tiles_of
 from scanfind.tiles.search import Owned, Searched, cell_of, middle_in, own, search
 from scanfind.tiles.tasks import Found, Job
@@ -165,7 +165,7 @@ def learnt_from(tallies: Iterable[Tally]) -> tuple[float, ...]:
     Never fewer than are believed of a model that nobody saw: nothing is searched longer for having been seen.
     """
     _, hits, shown = (np.sum(column, axis=0) for column in zip(*tallies, strict=True))
-    share = LEARNT * hits / np.maximum(shown, 1e-300)
+    share = believed_of_others(hits, shown)
     return tuple(np.where(hits > 0.0, np.maximum(share, RIGHT_PAIR_FINDS), 0.0).tolist())
 
 
