@@ -12,23 +12,19 @@ from numpy.typing import NDArray
 from scanfind.evidence.ends import FIXED, Slid, slid, with_faces
 from scanfind.evidence.free_space import Limits, caster_of, spoken_by_each
 from scanfind.grid.depth import Beams
-from scanfind.kernels.grid import NO_BEAM, cube_place, pack_beam
 from scanfind.library.model import Model, ModelParameters, build_model
 from scanfind.library.surface import SurfaceParameters
 from scanfind.pose import Pose
-from scanfind.recognition.in_place import design_of
+from scanfind.recognition.stands import as_designed
 from scanfind.recognition.swaps import are_alike, onto, pairs_alike
 from scanfind.recognition.witnesses import known_along
 from scanfind.simulate.parts import blocks, box
-from scanfind.simulate.scanner import Scanner, scan
-from scanfind.simulate.scene import Scene, SceneObject
+from seen import seen_of
 
 Floats = NDArray[np.float64]
 
 LIMITS = Limits(0.006, 0.03, 0.25)
 ALONG = np.array([1.0, 0.0, 0.0])
-WALL = blocks("wall", [((-4.0, 3.0, -2.0), (4.0, 3.1, 3.0))])
-STATIONS = np.array([[-1.0, -4.0, 0.6], [2.0, -4.0, 1.2]])
 
 
 def bar(length: float = 2.0, width: float = 0.2) -> Model:
@@ -48,17 +44,7 @@ def bar_seen(x: float) -> list[Beams]:
 def seen(model: Model, x: float) -> list[Beams]:
     """What two scanners keep of a bar before a wall."""
     assert model.mesh is not None
-    scene = Scene((SceneObject("wall", WALL, Pose.identity()), SceneObject("bar", model.mesh, at(x))), STATIONS)
-    return [beams_about(cloud.xyz, where) for cloud, where in
-            zip(scan(scene, scanner=Scanner(step=0.004), seed=1).stations, STATIONS, strict=True)]  # fmt: skip
-
-
-def beams_about(points: Floats, origin: Floats) -> Beams:
-    nearest = np.full(6 * 360**2, NO_BEAM)
-    for way in points - origin:
-        pixel, packed = pack_beam(*cube_place(*way), 360, float(np.linalg.norm(way)))
-        nearest[pixel] = min(nearest[pixel], packed)
-    return Beams(origin, nearest, 360)
+    return seen_of([(model.mesh, at(x))])
 
 
 @pytest.mark.parametrize("moved", [-0.08, -0.02, 0.05])
@@ -98,7 +84,7 @@ def test_what_the_design_has_in_front_hides_and_is_not_beside() -> None:
     beams = seen(cover, 0.0)
     alone = spoken_by_each(plate, caster_of(plate), at(0.0), beams, LIMITS).sum(axis=0)
     assert alone[1] > 0.5 * alone.sum()
-    design = design_of([plate, cover])
+    design = as_designed([plate, cover])
     told = spoken_by_each(plate, caster_of(plate), at(0.0), beams, LIMITS, design).sum(axis=0)
     assert told[1] < 0.05 * told.sum()
     assert told[3] > 0.9 * alone[1]
@@ -117,6 +103,13 @@ def test_a_model_is_put_onto_another_side_along_side_and_middle_to_middle() -> N
         points = way.move(one.samples.points)
         np.testing.assert_allclose(0.5 * (points.min(axis=0) + points.max(axis=0)), 0.5 * (low + high), atol=0.01)
         assert np.argmax(np.ptp(points, axis=0)) == 1
+
+
+def test_sides_of_about_one_length_are_put_along_each_other_in_every_way() -> None:
+    stub, beam = bar(0.21), bar(2.0, 0.21)
+    assert len(onto(stub, stub)) == 24
+    assert len(onto(beam, beam)) == 8
+    assert all(np.isclose(np.linalg.det(way.rotation), 1.0) for way in onto(stub, stub))
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -142,13 +142,7 @@ def find(
             write_left_over(remainder, chunks, findings)
     findings.scans = [source.told() for source in sources.all]
     with clock("verify"):
-        stations = findings.stations()
-        if at_design:
-            findings[:] = found.with_ends(findings)
-        if len(stations) > 1:
-            findings[:] = [found.with_stations(one, stations) for one in findings]
-        if at_design:
-            findings.elements = found.elements(findings, stations)
+        findings[:], findings.elements = found.told(findings, findings.stations(), at_design=at_design)
     findings.expected = parameters.priors.expected([model.name for model in library])
     findings.crs, findings.notes = sources.crs(), [*findings.as_known(), *found.notes()]
     findings.shift = found.shift()

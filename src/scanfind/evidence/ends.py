@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.evidence.free_space import Design, Limits, beams_to
+from scanfind.evidence.free_space import Limits, beams_to
 from scanfind.pose import Pose
 
 if TYPE_CHECKING:
+    from scanfind.evidence.neighbours import Design
     from scanfind.evidence.rays import RayCaster
     from scanfind.grid.depth import Beams
     from scanfind.library.model import Model
@@ -72,7 +73,8 @@ def slid(
     telling = np.flatnonzero((said != said[0]).any(axis=0))
     if neighbours is not None:
         theirs = beams.take(telling).moved(np.zeros(3) if offset is None else offset)
-        telling = telling[np.isinf(neighbours.met(model.name, theirs, limits.inlier))]
+        met = neighbours.met(model.name, theirs.origins, theirs.directions, theirs.ranges, limits.inlier)
+        telling = telling[~met]
     if not len(telling):
         return None
     steps = np.arange(-REACH_M, REACH_M + 0.5 * FINE_M, FINE_M)

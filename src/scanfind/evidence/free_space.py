@@ -17,6 +17,7 @@ from scanfind.mesh import Mesh
 from scanfind.pose import Pose
 
 if TYPE_CHECKING:
+    from scanfind.evidence.neighbours import Design
     from scanfind.grid.depth import Beams
     from scanfind.library.model import Model
 
@@ -29,6 +30,9 @@ ON, BESIDE, THROUGH, HIDDEN, NOTHING = range(5)
 MOST_BEAMS = 6000
 # Pixels this many sample spacings about each sample cover a model: no point of it is farther from one than 1.
 REACH_SPACINGS = 1.0
+# Where a beam ended on a surface and on another element as well it speaks for the surface only if that is so much
+# nearer, in inliers; and faces that lie on each other are no farther apart than so.
+TELLS_APART, FLUSH_M = 0.25, 5e-4
 # A piece of scan has no triangles: each of its samples stands for a square so many spacings wide.
 SQUARE_SPACINGS = 1.0
 
@@ -61,24 +65,6 @@ class Limits(NamedTuple):
     edge: float = 0.0
 
 
-class Design(NamedTuple):
-    """All elements where the design has them: what a beam met of them hides what it would have met behind.
-
-    caster : in the scans' own frame; models : name of the model of each mesh in it
-    """
-
-    caster: RayCaster
-    models: tuple[str, ...]
-
-    def met(self, model: str, beams: Towards, inlier: float) -> Floats:
-        """How far off beams ended on an element that is not of a model, (B,) metres; infinite where they did not."""
-        hits = self.caster.shoot(beams.origins, beams.directions)
-        other = np.array([name != model for name in self.models])[hits.owner]
-        first = np.isfinite(hits.distance) & other
-        off = np.abs(beams.ranges - np.where(first, hits.distance, 0.0)) * hits.cosine
-        return np.where(first & (off <= inlier), hits.distance, np.inf)
-
-
 def caster_of(model: Model) -> RayCaster:
     """A model's surface in its own frame, ready to be met by beams."""
     if model.mesh is not None:
@@ -101,10 +87,10 @@ def spoken_of(model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[
 
 def spoken_by_each(
     model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams], limits: Limits,
-    design: Design | None = None, offset: Floats | None = None,
+    design: Design | None = None, offset: Floats | None = None, without: frozenset[str] | None = None,
 ) -> Floats:  # fmt: skip
-    """What the beams of each of S scanners say: rows as of `Spoken`, (S, 4), m²; design, offset : see `verdicts`."""
-    met = verdicts(model, caster, placed, scanners, limits, design, offset)
+    """What the beams of each of S scanners say: rows as of `Spoken`, (S, 4), m²; design … without : see `verdicts`."""
+    met = verdicts(model, caster, placed, scanners, limits, design, offset, without)
     said = [met.says == of for of in (ON, BESIDE, THROUGH, HIDDEN)]
     return np.stack([np.bincount(met.scanner[each], met.area[each], len(scanners)) for each in said], axis=1)
 
@@ -124,7 +110,7 @@ class Verdicts(NamedTuple):
 
 def verdicts(
     model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams], limits: Limits,
-    design: Design | None = None, offset: Floats | None = None,
+    design: Design | None = None, offset: Floats | None = None, without: frozenset[str] | None = None,
 ) -> Verdicts:  # fmt: skip
     """What beams say of a model placed by scene_from_model, relative to the grid's offset, one by one.
 
@@ -144,14 +130,35 @@ def verdicts(
     before, apart = ranges[passed] - limits.margin, limits.edge or limits.inlier
     deep = within(caster, origins[passed], directions[passed], before, apart)
     says[passed] = np.where(deep, THROUGH, NOTHING)
-    if design is not None and (says == BESIDE).any():
-        # Steel lies on steel: a plate of 10 mm on a flange is nearer to it than beams of free space tell apart. Half a
-        # millimetre: faces that lie on each other hide nothing of each other.
-        some = np.flatnonzero(says == BESIDE)
+    if design is not None:
+        some = np.flatnonzero((says == BESIDE) | (says == ON))
         theirs = beams.take(met[some]).moved(np.zeros(3) if offset is None else offset)
-        says[some[design.met(model.name, theirs, limits.inlier) < distance[some] - 5e-4]] = HIDDEN
+        said = of_neighbours(
+            design.off(without or frozenset([model.name]), theirs.ends(), limits.inlier), ranges[some] - distance[some],
+            cosine[some], says[some], limits.inlier,
+        )  # fmt: skip
+        says[some] = said
     where = origins + directions * distance[:, None]
     return Verdicts(where, beams.angles[met] * distance**2 / cosine, beams.scanner[met], says)
+
+
+def of_neighbours(
+    off: Floats, behind: Floats, cosine: Floats, says: NDArray[np.uint8], inlier: float
+) -> NDArray[np.uint8]:
+    """What beams say that are on a surface or beside it, where another element of the design may have stopped them.
+
+    off : (B,) from their ends to the nearest other element; behind : how far behind the surface they ended, along
+        themselves, metres; cosine : of their angle to its normal
+    says : ON or BESIDE; inlier : see Limits
+    """
+    said = says.copy()
+    own = np.abs(behind) * cosine
+    theirs = off <= np.where(says == ON, own + TELLS_APART * inlier, inlier)
+    said[theirs & (says == ON)] = NOTHING
+    # Faces that lie on each other hide nothing of each other.
+    before = np.where(says == ON, behind * cosine < -TELLS_APART * inlier, behind < -FLUSH_M)
+    said[theirs & before] = HIDDEN
+    return said
 
 
 class Towards(NamedTuple):

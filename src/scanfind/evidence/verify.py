@@ -163,9 +163,12 @@ def rough_score(rough: Rough, blind: bool) -> float:
 
 
 def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters, *, in_place: bool = False) -> str:
-    """Why a pose is not believed, in words; empty where it is. in_place : see `score`."""
+    """Why a pose is not believed, in words; empty where it is.
+
+    in_place : see `score`; beams tell how much of it shows then, and not surfels, which know no flat bar of 8 mm
+    """
     least = parameters.min_support_blind if blind else parameters.min_support
-    if max(evidence.support(), evidence.lines) < least:
+    if (blind or not in_place) and max(evidence.support(), evidence.lines) < least:
         return f"only {evidence.support():.0%} of its surface lies on the scan, {least:.0%} is asked for"
     if score(evidence, blind, parameters, in_place=in_place) >= parameters.min_score:
         return ""

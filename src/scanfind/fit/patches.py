@@ -63,6 +63,8 @@ def measured(near: NearSurface, pose: Pose, xyz: Floats, jobs: int) -> tuple[NDA
     from scanfind.kernels.distance import distances
 
     shift, every = np.zeros(3), np.arange(len(xyz))
+    if not len(xyz):
+        return np.empty(0, np.float32), np.empty(0, np.int32)
     parts = in_threads(
         jobs, len(xyz), lambda i, j: distances(near, pose.rotation, pose.translation, shift, xyz, every[i:j])
     )

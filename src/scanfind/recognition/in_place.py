@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.design.elements import LEAST_LOOKED_AT, placements_of
-from scanfind.evidence.free_space import Design
-from scanfind.evidence.rays import RayCaster
 from scanfind.evidence.verify import score, why_refused
 from scanfind.fit.refine import Refined, as_they_are, held, shrinking
 from scanfind.pose import Pose
-from scanfind.recognition.around import STEPS_M, across, beside, long_side, of_others, peaks
+from scanfind.recognition.around import FARTHEST_M, across, drawn_in, long_side, of_others
 from scanfind.recognition.candidate import Candidate, Standing
 from scanfind.recognition.claims import Claims
+from scanfind.recognition.stands import as_designed
 from scanfind.recognition.swaps import GAIN, explained, looked_at, onto, pairs_alike
 from scanfind.search.hypotheses import joined
 
 if TYPE_CHECKING:
+    from scanfind.evidence.neighbours import Design
     from scanfind.library.model import Model
     from scanfind.mesh import Placement
     from scanfind.recognition.fitting import Fitting
@@ -34,8 +34,8 @@ Floats = NDArray[np.float64]
 DRAWN_IN_CELLS = (2.0, 0.75)  # of the largest: how far off its design an element is met at once …
 FARTHER_IF = 1.2  # … where so many more of its samples meet the scan there than about the design
 IN_PLACE_M = 0.06  # what ICP carried no farther off is still where the design puts it
-AROUND_MOST_M = 0.12  # what is found beside the place of an element is no farther off than this …
-STANDS_OUT_M, STANDS_OUT = 0.04, 0.25  # … and so far to each side so much less of what is looked at is explained
+# Of what is found beside the place of an element: so far to each side so much less of what is looked at is explained.
+STANDS_OUT_M, STANDS_OUT = 0.04, 0.25
 
 
 class Asked(NamedTuple):
@@ -128,19 +128,22 @@ class InPlace:
         moved : where ICP carried it; others : what else stands
         """
         ground, number = self._ground, asked.model
-        model = ground.models[number]
-        starts = beside(asked.pose(), model.samples.points)
-        said = [self._weighing.spoken_of(number, each, in_place=True) for each in starts]
-        best = peaks(np.array([explained(each) for each in said], np.float64).reshape(len(STEPS_M), -1))
-        found = self._on_beams(self._on_beams(as_they_are(ground.placements(number, [starts[k] for k in best]))))
+        model, inlier = ground.models[number], self._weighing.fine.inlier
+        surface = self._fitting.near(number)._replace(reach=FARTHEST_M)
+        ends, areas = self._weighing.witnesses.unexplained(model, asked.pose(), surface)
+        own = ~of_others(ends + ground.offset, others, inlier)
+        if areas[own].sum() < LEAST_LOOKED_AT * model.area:
+            return None
+        poses = drawn_in(surface, asked.pose(), model.samples.points, ends[own], 2.0 * inlier)
+        found = self._on_beams(as_they_are(ground.placements(number, poses)))
         for each in sorted(
             [moved, *self._weighing.candidates(found, in_place=True)], key=lambda c: -explained(c.evidence.spoken)
         ):
-            if ground.apart(each, asked) > AROUND_MOST_M or self.why_not(each) or not self._stands_out(each):
+            if ground.apart(each, asked) > FARTHEST_M or self.why_not(each) or not self._stands_out(each):
                 continue
             one = self._at_its_ends(each)
-            met = self._weighing.witnesses.met(model, one.pose())
-            shared = of_others(*met, others, self._weighing.fine.inlier)
+            where, much = self._weighing.witnesses.met(model, one.pose())
+            shared = much[of_others(where, others, inlier)].sum() / max(much.sum(), 1e-300)
             if shared <= ground.parameters.verify.shared and not ground.why_not_allowed(one):
                 return one
         return None
@@ -182,7 +185,11 @@ class InPlace:
         bests = [self._better(*pair) for pair in zip(moved_all, asked_all, strict=True)]
         around = {} if ground.blind else self._beside(asked_all, bests, before)
         bests = [around.get(k, best) for k, best in enumerate(bests)]
-        swapped = {} if ground.blind else self._swapped(bests)
+        in_their_places = [
+            asked if ground.apart(best, asked) > IN_PLACE_M else best
+            for asked, best in zip(asked_all, bests, strict=True)
+        ]
+        swapped = {} if ground.blind else self._swapped(in_their_places)
         for k, (asked, best) in enumerate(zip(asked_all, bests, strict=True)):
             if k in swapped or k in around:
                 believed.append(swapped.get(k, best))
@@ -214,7 +221,7 @@ class InPlace:
         ]
         sound = [best for k, best in enumerate(bests) if k not in empty]
         others = [*self._standing, *map(self._stands, [*before, *sound])]
-        for k in empty:
+        for k in sorted(empty, key=lambda k: -ground.models[asked[k].model].area):  # small ones are drawn to large ones
             if one := self._around(asked[k], bests[k], others):
                 found[k] = one
                 others.append(self._stands(one))
@@ -230,7 +237,7 @@ class InPlace:
         What fails in its place is believed beside it only where it stands out.
         """
         best = max(asked, moved, key=lambda candidate: candidate.score)
-        if best is asked or not self.why_not(asked):
+        if best is asked or not self.why_not(asked) or self._looked_at_too_little(moved):
             return asked if self._ground.apart(best, asked) > IN_PLACE_M else best
         near = self._ground.apart(best, asked) <= IN_PLACE_M and not self._ground.blind
         return asked if near and not self._stands_out(best) else best
@@ -267,37 +274,30 @@ class InPlace:
         """Another model where one stands, the way round that beams speak for."""
         pose = stands.pose()
         ways = [pose @ way for way in onto(self._ground.models[model], self._ground.models[stands.model])]
-        best = max(ways, key=lambda way: explained(self._weighing.spoken_of(model, way)))
+        other = self._ground.models[stands.model].name
+        said = [self._weighing.spoken_of(model, way, in_place=True, instead_of=other) for way in ways]
+        best = ways[int(np.argmax([explained(each) for each in said]))]
         start = self._ground.placements(model, [best])
         refined = self._fitted(start, start)
         asked, found = (
-            self._weighing.candidates(each, in_place=True)[0] for each in (refined._replace(hypotheses=start), refined)
+            self._weighing.candidates(each, in_place=True, instead_of=other)[0]
+            for each in (refined._replace(hypotheses=start), refined)
         )
         better = asked if self._ground.apart(found, asked) > IN_PLACE_M else found
         return better._replace(instead_of=place)
 
     def why_not(self, candidate: Candidate) -> str:
         """Why an element is not believed to stand where the design puts it; empty where it is."""
-        on, beside, through, _ = candidate.evidence.spoken
-        enough = LEAST_LOOKED_AT * self._ground.models[candidate.model].area
-        if not self._ground.blind and on + beside + through < enough:
+        if self._looked_at_too_little(candidate):
             return "scanners looked at too little of it to be sure"
         return why_refused(candidate.evidence, self._ground.blind, self._ground.parameters.verify, in_place=True)
+
+    def _looked_at_too_little(self, candidate: Candidate) -> bool:
+        """Do beams say too little of a pose to be asked? One that hides within others nothing speaks against."""
+        enough = LEAST_LOOKED_AT * self._ground.models[candidate.model].area
+        return not self._ground.blind and looked_at(candidate.evidence.spoken) < enough
 
 
 def asked_of(models: Sequence[Model]) -> Asked:
     """All elements of a design."""
-    return Asked({model.name: placements_of(model) for model in models}, {}, design_of(models))
-
-
-def design_of(models: Sequence[Model]) -> Design | None:
-    """Elements where the design has them; None where it has no meshes."""
-    placed = [
-        (model.name, model.mesh, each.design_from_model)
-        for model in models
-        if model.mesh is not None
-        for each in placements_of(model)
-    ]
-    if not placed:
-        return None
-    return Design(RayCaster([(mesh, pose) for _, mesh, pose in placed]), tuple(name for name, _, _ in placed))
+    return Asked({model.name: placements_of(model) for model in models}, {}, as_designed(models))

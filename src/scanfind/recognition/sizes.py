@@ -16,6 +16,7 @@ from scanfind.cloud import shift_for
 from scanfind.grid.scene import first_cell
 from scanfind.library.near_surface import near_model
 from scanfind.recognition.candidate import Standing
+from scanfind.recognition.stands import as_found
 
 if TYPE_CHECKING:
     from scanfind.design.elements import Element
@@ -119,30 +120,28 @@ class Sizes:
         """A detection with its parts fitted to raw points (N, 3) around it, scan frame; None: it has no parts."""
         return found if points is None else self._of(found.model).telling.measured(found, points)
 
-    def with_stations(self, found: Detection, stations: Floats) -> Detection:
-        """A detection with what each station says of it; stations : where all of them stood, in order, (S, 3)."""
-        search = self._of(found.model)
-        model = next(model for model in search.models if model.name == found.model)
-        return search.weighing.witnesses.with_stations(model, found, stations)
+    def told(
+        self, detections: Sequence[Detection], stations: Floats, *, at_design: bool
+    ) -> tuple[list[Detection], list[Element]]:
+        """Detections with what their ends and each station say, and what became of each element of the design.
 
-    def with_ends(self, detections: Sequence[Detection]) -> list[Detection]:
-        """Detections, those that stand for an element slid to where beams say that their ends are."""
-        told = {
-            key: one
-            for search in self.all
-            for model in search.models
-            for key, one in search.weighing.witnesses.with_ends(model, detections).items()
-        }
-        return [told.get(one.id, one) for one in detections]
-
-    def elements(self, detections: Sequence[Detection], stations: Floats) -> list[Element]:
-        """What became of each element of the design, in the order of the models; stations : see `with_stations`."""
-        told = {
-            model.name: search.weighing.witnesses.elements(model, detections, stations)
-            for search in self.all
-            for model in search.models
-        }
-        return [element for model in self._models for element in told[model.name]]
+        stations : where all of them stood, in order, (S, 3); at_design : there are elements, in the order of the models
+        """
+        elements: dict[str, list[Element]] = {}
+        by_ends = {one.id: one for one in detections}
+        every = [(model, search.weighing.witnesses) for search in self.all for model in search.models]
+        if at_design:
+            for model, witnesses in every:
+                by_ends |= witnesses.with_ends(model, detections)
+            stand = as_found(self._models, detections)
+            every = [(model, witnesses.among(stand)) for model, witnesses in every]
+        found = list(by_ends.values())
+        if len(stations) > 1:
+            among = {model.name: (model, witnesses) for model, witnesses in every}
+            found = [among[one.model][1].with_stations(among[one.model][0], one, stations) for one in found]
+        if at_design:
+            elements = {model.name: witnesses.elements(model, found, stations) for model, witnesses in every}
+        return found, [element for model in self._models for element in elements.get(model.name, ())]
 
     def noise(self) -> float:
         """Spread of the raw points about the largest parts found, metres."""

@@ -7,7 +7,7 @@ missing at its ends: each of them, asked alone, looks like itself. Asked togethe
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import combinations, permutations, product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,19 +46,15 @@ def pairs_alike(models: Sequence[Model]) -> set[tuple[int, int]]:
 
 
 def onto(model: Model, other: Model) -> list[Pose]:
-    """What puts a model where another is, side along side and middle to middle: in each of four ways round."""
-    frames, middles = [], []
-    for each in (model, other):
-        points = each.samples.points
-        axes = np.eye(3)[np.argsort(-np.ptp(points, axis=0), kind="stable")]
-        axes[2] *= np.linalg.det(axes)
-        frames.append(axes)
-        middles.append(0.5 * (points.min(axis=0) + points.max(axis=0)))
-    found = []
-    for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)):
-        turn = frames[1].T @ np.diag(signs) @ frames[0]
-        found.append(Pose(turn, middles[1] - turn @ middles[0]))
-    return found
+    """What puts a model where another is, middle to middle and sides along sides of about their length: in each way."""
+    boxes = [(each.samples.points.min(axis=0), each.samples.points.max(axis=0)) for each in (model, other)]
+    (mine, my_middle), (theirs, middle) = ((high - low, 0.5 * (low + high)) for low, high in boxes)
+    sides = list(permutations(range(3)))
+    turns = [np.diag(signs)[list(order)] for order in sides for signs in product((1.0, -1.0), repeat=3)]
+    turns = [turn for turn in turns if np.linalg.det(turn) > 0.0]
+    misfit = np.array([np.abs(np.abs(turn) @ mine - theirs).max() for turn in turns])
+    ways = np.flatnonzero(misfit < misfit.min() + SECTION_M)
+    return [Pose(turns[k], middle - turns[k] @ my_middle) for k in ways]
 
 
 def explained(spoken: Spoken) -> float:

@@ -18,7 +18,7 @@ from scanfind.recognition.witnesses import Witnesses
 from scanfind.threads import in_threads
 
 if TYPE_CHECKING:
-    from scanfind.evidence.free_space import Design
+    from scanfind.evidence.neighbours import Design
     from scanfind.evidence.verify import Rough, VerifyParameters
     from scanfind.fit.refine import Refined
     from scanfind.recognition.ground import Ground
@@ -58,11 +58,14 @@ class Weighing:
         limits = Limits(self.fine.inlier, self.fine.margin(parameters.verify), parameters.verify.least_facing)
         self.witnesses = Witnesses(scene.beams, ground.offset, limits, design)
 
-    def candidates(self, refined: Refined, *, in_place: bool = False) -> list[Candidate]:
-        """Refined poses with their evidence; in_place : of where the design puts the models."""
+    def candidates(self, refined: Refined, *, in_place: bool = False, instead_of: str = "") -> list[Candidate]:
+        """Refined poses with their evidence.
+
+        in_place : of where the design puts the models; instead_of : the model in whose place they stand
+        """
         self._ground.fit_near(refined.hypotheses, ceil(self._ground.parameters.verify.gate_cells))
         found, models, blind, verify = [], self._ground.models, self._ground.blind, self._ground.parameters.verify
-        for k, seen in enumerate(self._evidence(refined.hypotheses, in_place=in_place)):
+        for k, seen in enumerate(self._evidence(refined.hypotheses, in_place, instead_of)):
             number = int(refined.hypotheses.models[k])
             # What a pose explains of the scene, in samples; what beams passed through counts double.
             net = (seen.telling - NET_PENALTY * seen.penalty()) * seen.samples
@@ -75,8 +78,8 @@ class Weighing:
             )  # fmt: skip
         return found
 
-    def _evidence(self, hypotheses: Hypotheses, *, in_place: bool) -> list[Evidence]:
-        """What surfels and beams say of poses near which the fine surfels are fitted; in_place : see `candidates`."""
+    def _evidence(self, hypotheses: Hypotheses, in_place: bool, instead_of: str) -> list[Evidence]:
+        """What surfels and beams say of poses near which the fine surfels are fitted; for the rest see `candidates`."""
         ground, verify = self._ground, self._ground.parameters.verify
         support = gather_support(
             hypotheses, ground.scene, self.fine, self.thin, ground.arrays, ground.signed, verify, ground.jobs
@@ -86,7 +89,7 @@ class Weighing:
         spoken = in_threads(
             ground.jobs, len(poses),
             lambda start, stop: [
-                self.spoken_of(int(number), Pose(rotation, translation), in_place=in_place)
+                self.spoken_of(int(number), Pose(rotation, translation), in_place=in_place, instead_of=instead_of)
                 for number, rotation, translation in poses[start:stop]
             ],
         )  # fmt: skip
@@ -95,9 +98,10 @@ class Weighing:
             for seen, said, on_lines, number in zip(support, chain(*spoken), lines, hypotheses.models, strict=True)
         ]
 
-    def spoken_of(self, number: int, placed: Pose, *, in_place: bool = False) -> Spoken:
-        """What beams say of a model at a pose relative to the grid's offset; in_place : see `candidates`."""
-        by_each = self.witnesses.say_by_each(self._ground.models[number], placed, in_place=in_place)
+    def spoken_of(self, number: int, placed: Pose, *, in_place: bool = False, instead_of: str = "") -> Spoken:
+        """What beams say of a model at a pose relative to the grid's offset; for the rest see `candidates`."""
+        model = self._ground.models[number]
+        by_each = self.witnesses.say_by_each(model, placed, in_place=in_place, instead_of=instead_of)
         return Spoken(*by_each.sum(axis=0).tolist())
 
     def best_drawn(self, hypotheses: Hypotheses) -> Hypotheses:

@@ -12,20 +12,24 @@ from numpy.typing import NDArray
 from scanfind.design.elements import Element, assigned, elements_of, open_slide, placements_of, said_by
 from scanfind.detection import Detection, Motion
 from scanfind.evidence.ends import Slid, slid, with_faces
-from scanfind.evidence.free_space import ON, Limits, caster_of, spoken_by_each, verdicts
+from scanfind.evidence.free_space import ON, Limits, beams_to, caster_of, spoken_by_each, verdicts
+from scanfind.fit.patches import measured
 from scanfind.fit.refine import triple
 from scanfind.pose import Pose
 
 if TYPE_CHECKING:
-    from scanfind.evidence.free_space import Design
+    from scanfind.evidence.neighbours import Design
     from scanfind.evidence.rays import RayCaster
     from scanfind.grid.depth import Beams
+    from scanfind.kernels.distance import NearSurface
     from scanfind.library.model import Model
 
 Floats = NDArray[np.float64]
 
 EDGE_INLIERS = 2.0  # a laser's spot is a centimetre wide at 10 m: nearer to the outline some of it went past
 MOVED_M = 0.01  # an element that is so far off across a slide was moved: along it nothing says that it was not
+MOST_ABOUT = 20_000  # beams asked for what stands about a place; what is so near to a neighbour may be the neighbour's
+NEIGHBOUR_INLIERS = 1.5
 ALONG = 0.95  # cosine between a slide and one that is the same
 
 
@@ -45,18 +49,34 @@ class Witnesses:
     design: Design | None
     _casters: dict[str, RayCaster] = field(default_factory=dict, init=False)
 
-    def say_by_each(self, model: Model, placed: Pose, *, in_place: bool = False) -> Floats:
+    def say_by_each(self, model: Model, placed: Pose, *, in_place: bool = False, instead_of: str = "") -> Floats:
         """What each says of a model at a pose relative to the grid's offset, rows as of Spoken, (S, 4), m².
 
-        in_place : of where the design puts it
+        in_place : of where the design puts it; instead_of : the model in whose place it stands
         """
-        return spoken_by_each(model, *self._asks(model, placed, in_place=in_place))
+        without = frozenset([model.name, instead_of])
+        return spoken_by_each(model, *self._asks(model, placed, in_place=in_place), without)
 
     def met(self, model: Model, placed: Pose) -> tuple[Floats, Floats]:
         """Where beams meet a model as the design puts it, (N, 3) in the scans' own frame, and of how much, (N,) m²."""
         met = verdicts(model, *self._asks(model, placed, in_place=True))
         on = met.says == ON
         return placed.move(met.where[on]) + self.offset, met.area[on]
+
+    def unexplained(self, model: Model, placed: Pose, surface: NearSurface) -> tuple[Floats, Floats]:
+        """Where beams ended about a model as the design puts it and on no other element of the design.
+
+        surface : of the model; as far as it reaches beams are asked for
+        Returns (N, 3) relative to the grid's offset, and of how much, (N,) m²: less than it is where they graze it.
+        """
+        beams = beams_to(placed.move(model.samples.points), surface.reach + model.spacing, self.beams, MOST_ABOUT)
+        ends, areas = beams.ends(), beams.angles * beams.ranges**2
+        about = np.flatnonzero(measured(surface, placed, ends, 1)[1] >= 0)
+        if self.design is not None:
+            within = NEIGHBOUR_INLIERS * self.limits.inlier
+            own = frozenset([model.name])
+            about = about[np.isinf(self.design.off(own, ends[about] + self.offset, within))]
+        return ends[about], areas[about]
 
     def _asks(
         self, model: Model, placed: Pose, *, in_place: bool
@@ -70,8 +90,17 @@ class Witnesses:
         """What each says of a model at a pose in the scans' own frame: as `say_by_each`, in place where asked so."""
         return self.say_by_each(model, self._in_grid(pose), in_place=self.design is not None)
 
+    def among(self, design: Design | None) -> Witnesses:
+        """The same scanners, where elements stand as in another design."""
+        told = replace(self, design=design)
+        told._casters.update(self._casters)
+        return told
+
     def elements(self, model: Model, detections: Sequence[Detection], stations: Floats) -> list[Element]:
         """What became of each element of the design that is of a model.
+
+        The elements of the design these know should stand as they were found (see `among`): what one that was moved
+        stopped says nothing of another's place.
 
         detections : as they are reported; stations : where all of them stood, in order, (S, 3)
         """

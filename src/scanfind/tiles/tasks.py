@@ -22,14 +22,15 @@ from scanfind.isolation.isolate import IsolateParameters, Isolator, Placed, join
 from scanfind.library.near_surface import near_model
 from scanfind.parameters import Parameters
 from scanfind.pose import Pose
-from scanfind.recognition.in_place import AROUND_MOST_M, design_of
+from scanfind.recognition.around import FARTHEST_M
+from scanfind.recognition.stands import as_designed
 from scanfind.scans.sources import Scan, source_of
 from scanfind.tiles.plan import BASE_BYTES, bin_metres, margin_of
 from scanfind.tiles.stored import Store, summed_rows
 
 if TYPE_CHECKING:
     from scanfind.dimensions import Plan
-    from scanfind.evidence.free_space import Design
+    from scanfind.evidence.neighbours import Design
     from scanfind.kernels.distance import NearSurface
     from scanfind.library.model import Model
 
@@ -77,7 +78,7 @@ class Job:
     def margin(self, models: Sequence[Model]) -> int:
         """How many bins around a tile the search for some models needs."""
         # What is beside its place in the design is its owner's all the same.
-        beside = AROUND_MOST_M if self.at_design else 0.0
+        beside = FARTHEST_M if self.at_design else 0.0
         return ceil((margin_of(models) + beside) / self.bin_m())
 
 
@@ -118,7 +119,7 @@ def models_in(folder: Path) -> list[Model]:
 @lru_cache(maxsize=2)
 def design_in(folder: Path) -> Design | None:
     """All elements of a design in their places, made ready for beams once a worker."""
-    return design_of(models_in(folder))
+    return as_designed(models_in(folder))
 
 
 @lru_cache(maxsize=256)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from scanfind.design.elements import assigned, elements_of, placements_of
 from scanfind.recognition.sizes import by_size
+from scanfind.recognition.stands import as_found
 from scanfind.recognition.witnesses import Witnesses
 from scanfind.tiles.search import middle_in
 from scanfind.tiles.stored import beams_into, parts_of
@@ -71,10 +72,11 @@ def all_told(
     stations : where all scanners stood, in order, (S, 3); scans : the folders of those summed up
     """
     tasks = {}
+    bare = [replace(one, isolated=None) for one in findings]
     for group, (models, found) in enumerate(zip(by_size(job.models()), searched, strict=True)):
         for tile, some in asked_of_tiles(job, models, found, findings).items():
             limits = found[tile].limits
-            tasks[f"tell-{group}-{tile.name()}"] = (tell, job, some, limits, stations, scans)
+            tasks[f"tell-{group}-{tile.name()}"] = (tell, job, some, bare, limits, stations, scans)
     said: dict[tuple[str, int], Floats] = {}
     told: dict[int, Detection] = {}
     numbers: list[int] = []
@@ -117,20 +119,22 @@ def nearest(job: Job, tiles: Iterable[Tile], name: str, pose: Pose) -> Tile:
 
 
 def tell(
-    folder: Path, job: Job, asked: Questions, limits: Limits, stations: Floats, scans: Sequence[Path]
+    folder: Path, job: Job, asked: Questions, found: Sequence[Detection], limits: Limits, stations: Floats,
+    scans: Sequence[Path],
 ) -> Answers:  # fmt: skip
-    """Ask all scanners; limits : of the tile; stations, scans : see `all_told`."""
+    """Ask all scanners; found : all detections; limits : of the tile; stations, scans : see `all_told`."""
     grid, models = job.grid(), {model.name: model for model in job.models()}
     grid.look(beams_into(parts_of(scans), EVERYWHERE))
     design = design_in(job.folder) if job.at_design else None
     witnesses = Witnesses(grid.beams(), np.array(job.offset), limits, design)
+    among = witnesses.among(as_found(job.models(), found)) if job.at_design else witnesses
     said = {
-        (name, k): witnesses.say_at(models[name], placements_of(models[name])[k].design_from_model)
+        (name, k): among.say_at(models[name], placements_of(models[name])[k].design_from_model)
         for name, k in asked.places
     }
     detections = {}
     for one, place in asked.detections:
         model = models[one.model]
         told = one if place is None else witnesses.at_its_ends(model, one, place)
-        detections[one.id] = witnesses.with_stations(model, told, stations) if len(stations) > 1 else told
+        detections[one.id] = among.with_stations(model, told, stations) if len(stations) > 1 else told
     return Answers(said, detections, witnesses.numbers(stations))
