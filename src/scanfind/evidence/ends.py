@@ -27,6 +27,8 @@ Floats = NDArray[np.float64]
 
 REACH_M = 0.15  # to either side: how far ICP may have slid, and an element may have been moved
 COARSE, FINE_M = 31, 0.001  # beams that say the same in all of so many places say nothing; then a millimetre a place
+# Where so many beams less speak for a place than for the best, or so large a share of those that tell, it is not near.
+LEAST_LEAD, LEAD = 40, 0.2
 # Were each beam that changes its mind between two places a coin, the difference would be within so many times the root
 # of their number. Of the elements of a tuning scene that were not moved one exceeded it, along a neighbour's flange.
 SURE = 3.0
@@ -77,7 +79,10 @@ def slid(
         telling = telling[~met]
     if not len(telling):
         return None
+    roughly = said[:, telling].sum(axis=1, dtype=np.int64)
+    likely = coarse[roughly >= roughly.max() - max(LEAST_LEAD, LEAD * len(telling))]
     steps = np.arange(-REACH_M, REACH_M + 0.5 * FINE_M, FINE_M)
+    steps = steps[(np.abs(steps[:, None] - likely) < 1.5 * (coarse[1] - coarse[0])).any(axis=1)]
     sums = np.array([votes(step, telling).sum(dtype=np.int64) for step in steps], np.float64)
     weight = np.exp(sums - sums.max())
     weight /= weight.sum()

@@ -17,7 +17,17 @@ from scanfind.recognition.around import FARTHEST_M, across, drawn_in, long_side,
 from scanfind.recognition.candidate import Candidate, Standing
 from scanfind.recognition.claims import Claims
 from scanfind.recognition.stands import as_designed
-from scanfind.recognition.swaps import GAIN, explained, looked_at, onto, pairs_alike
+from scanfind.recognition.swaps import (
+    GAIN,
+    ROUGH_GAIN,
+    explained,
+    looked_at,
+    missing,
+    more_explained,
+    onto,
+    pairs_alike,
+    sides_of,
+)
 from scanfind.search.hypotheses import joined
 
 if TYPE_CHECKING:
@@ -247,36 +257,45 @@ class InPlace:
 
         bests : of the place of each element, what the design has there, as it was found
         """
-        alike, stand_ins, told = pairs_alike(self._ground.models), {}, []
+        alike, told = pairs_alike(self._ground.models), []
+        stand_ins: dict[tuple[int, int], Candidate | None] = {}
+
+        def gain(here: int, there: int) -> float:
+            """What share of what is looked at here is explained more where the element of another place stands here."""
+            key, is_there = (here, bests[there].model), bests[here].evidence.spoken
+            if key not in stand_ins:
+                stand_ins[key] = self._instead(bests[here], bests[there].model, self._places[here])
+            instead = stand_ins[key]
+            return -np.inf if instead is None else more_explained(instead.evidence.spoken, is_there)
+
         for places in combinations(range(len(bests)), 2):
-            pair = [bests[k] for k in places]
-            if tuple(sorted(each.model for each in pair)) not in alike:
+            if tuple(sorted(bests[k].model for k in places)) not in alike:
                 continue
-            gains = []
-            for here, there in (places, places[::-1]):
-                is_there, model = bests[here].evidence.spoken, bests[there].model
-                if (here, model) not in stand_ins:
-                    stand_ins[here, model] = self._instead(bests[here], model, self._places[here])
-                more = explained(stand_ins[here, model].evidence.spoken) - explained(is_there)
-                gains.append(more / max(looked_at(is_there), 1e-300))
-                if gains[-1] < GAIN:
-                    break
-            else:
-                told.append((sum(gains), places))
+            # Of the longer one something is missing where the shorter stands: asked first, that costs nothing.
+            longer, shorter = sorted(places, key=lambda k: -sides_of(self._ground.models[bests[k].model])[-1])
+            if missing(bests[longer].evidence.spoken) < 0.5 * GAIN:
+                continue
+            gains = gain(longer, shorter)
+            if gains >= GAIN and (other := gain(shorter, longer)) >= GAIN:
+                told.append((gains + other, places))
         found: dict[int, Candidate] = {}
         for _, (one, other) in sorted(told, reverse=True):
             instead = {one: stand_ins[one, bests[other].model], other: stand_ins[other, bests[one].model]}
-            if not found.keys() & instead.keys() and not any(map(self.why_not, instead.values())):
-                found |= instead
+            sound = {k: each for k, each in instead.items() if each and not self.why_not(each)}
+            if len(sound) == len(instead) and not found.keys() & instead.keys():
+                found |= sound
         return found
 
-    def _instead(self, stands: Candidate, model: int, place: Placement) -> Candidate:
-        """Another model where one stands, the way round that beams speak for."""
+    def _instead(self, stands: Candidate, model: int, place: Placement) -> Candidate | None:
+        """Another model where one stands, the way round that beams speak for; None where it plainly does not."""
         pose = stands.pose()
         ways = [pose @ way for way in onto(self._ground.models[model], self._ground.models[stands.model])]
         other = self._ground.models[stands.model].name
         said = [self._weighing.spoken_of(model, way, in_place=True, instead_of=other) for way in ways]
-        best = ways[int(np.argmax([explained(each) for each in said]))]
+        explain = [explained(each) for each in said]
+        best = ways[int(np.argmax(explain))]
+        if more_explained(said[int(np.argmax(explain))], stands.evidence.spoken) < -ROUGH_GAIN:
+            return None
         start = self._ground.placements(model, [best])
         refined = self._fitted(start, start)
         asked, found = (

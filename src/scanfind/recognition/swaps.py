@@ -26,6 +26,7 @@ SECTION_M, LONGER_M, LONGER = 0.02, 0.015, 0.25
 # Of what scanners looked at, so much more must be explained in both places. What is known of a share is known to half a
 # per cent, and here the same beams are asked of both.
 GAIN = 0.005
+ROUGH_GAIN = 0.02  # before it is fitted what stands there may seem to explain so much less
 
 
 def sides_of(model: Model) -> Floats:
@@ -65,3 +66,13 @@ def explained(spoken: Spoken) -> float:
 def looked_at(spoken: Spoken) -> float:
     """How much surface scanners looked at, m²."""
     return spoken.on + spoken.beside + spoken.through
+
+
+def more_explained(instead: Spoken, stands: Spoken) -> float:
+    """How much more one explains than another in the same place, as a share of what was looked at of that other."""
+    return (explained(instead) - explained(stands)) / max(looked_at(stands), 1e-300)
+
+
+def missing(spoken: Spoken) -> float:
+    """The share of the surface looked at that is not there."""
+    return (spoken.beside + spoken.through) / max(looked_at(spoken), 1e-300)
