@@ -92,7 +92,8 @@ def spoken_by_each(
     """What the beams of each of S scanners say: rows as of `Spoken`, (S, 4), m²; design … without : see `verdicts`."""
     met = verdicts(model, caster, placed, scanners, limits, design, offset, without)
     said = [met.says == of for of in (ON, BESIDE, THROUGH, HIDDEN)]
-    return np.stack([np.bincount(met.scanner[each], met.area[each], len(scanners)) for each in said], axis=1)
+    areas = [np.bincount(met.scanner[each], met.area[each], len(scanners)) for each in said]
+    return np.stack(areas, axis=1).astype(np.float64)  # of no beams at all numpy counts integers
 
 
 class Verdicts(NamedTuple):

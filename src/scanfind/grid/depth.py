@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,9 @@ DEPTH_PIXELS = 360  # along an edge of the cube map: 0.25° a pixel, 35 mm at 8 
 # they speak of tell (verify.spread). Joined further, a part missing from the scan is taken for one seen through.
 LEAST_SPOKEN, LEAST_DEPTH_PIXELS = 0.08, 45
 ENOUGH_AROUND = 3  # of a pixel and the four beside it must be filled for a sample to be seen through or hidden
+# Beams into the open: of directions towards a surface so many must bring something back for silence to tell; what does
+# not come back went so far; an azimuth is known to a degree; the middle of a pixel (kernels.grid.pack_beam).
+LEAST_FILLED, OPEN_M, AZIMUTHS, PIXELS_MIDDLE = 0.3, 1e4, 360, (128 << 8) | 128
 LOOKED_AT = 45  # patches along an edge, of 2°: one with any range in it was looked at
 
 
@@ -27,6 +31,40 @@ class Beams(NamedTuple):
     origin: Floats
     nearest: NDArray[np.int64]
     edge: int
+
+    def silent(self) -> NDArray[np.bool_]:
+        """Where the scanner looked and nothing came back, (6 · edge²,); nowhere if too seldom something does.
+
+        A scanner sweeps all directions of one elevation alike, and all elevations at each azimuth: it looked wherever
+        one came back as steeply somewhere, and one at all that way. z is up.
+        """
+        from scanfind.kernels.grid import NO_BEAM
+
+        filled = self.nearest < NO_BEAM
+        if self.filled() < LEAST_FILLED:
+            return np.zeros_like(filled)
+        elevation, azimuth = angles_of(self.edge)
+        low, high = elevation[filled].min(), elevation[filled].max()
+        turned = np.zeros(AZIMUTHS, np.bool_)
+        turned[azimuth[filled]] = True
+        turned |= np.roll(turned, 1) | np.roll(turned, -1)
+        return np.asarray(~filled & turned[azimuth] & (elevation >= low) & (elevation <= high))
+
+    def into_the_open(self, silent: NDArray[np.bool_]) -> Beams:
+        """Beams that went on without end where the scanner saw nothing; silent : see there."""
+        from scanfind.kernels.grid import NO_BEAM, RANGE_UNITS
+
+        endless = (np.int64(OPEN_M * RANGE_UNITS) << 16) | PIXELS_MIDDLE
+        return Beams(self.origin, np.where(silent, endless, NO_BEAM), self.edge)
+
+    def filled(self) -> float:
+        """The share of directions towards a surface that brought a beam back: of patches, that of the upper quarter."""
+        from scanfind.kernels.grid import NO_BEAM
+
+        few = self.edge // LOOKED_AT
+        patches = (self.nearest < NO_BEAM).reshape(6, LOOKED_AT, few, LOOKED_AT, few).mean(axis=(2, 4))
+        looked = patches[patches > 0.0]
+        return float(np.quantile(looked, 0.75)) if len(looked) else 0.0
 
     def ranges(self) -> DepthMap:
         """How far they went, and no more."""
@@ -65,6 +103,19 @@ class DepthMap(NamedTuple):
         looked = filled.reshape(6, LOOKED_AT, few, LOOKED_AT, few).any(axis=(2, 4))
         looked = looked.repeat(few, axis=1).repeat(few, axis=2)
         return float((around >= ENOUGH_AROUND)[looked].mean()) if looked.any() else 1.0
+
+
+@lru_cache(maxsize=2)
+def angles_of(edge: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """The elevation of each pixel's middle, radians, and its azimuth in AZIMUTHS steps, (6 · edge²,)."""
+    from scanfind.kernels.beams import beams_of
+
+    every = np.arange(6 * edge**2)
+    ways, ranges, angles = np.empty((len(every), 3)), np.empty(len(every)), np.empty(len(every))
+    beams_of(every, np.full(len(every), PIXELS_MIDDLE), edge, ways, ranges, angles)
+    turn = np.arctan2(ways[:, 1], ways[:, 0]) / (2.0 * np.pi) % 1.0
+    azimuth = np.minimum((turn * AZIMUTHS).astype(np.intp), AZIMUTHS - 1)
+    return np.arcsin(np.clip(ways[:, 2], -1.0, 1.0)).astype(np.float32), azimuth
 
 
 def joined_until_spoken(maps: list[DepthMap]) -> list[DepthMap]:

@@ -193,16 +193,10 @@ class InPlace:
         believed, refused, elsewhere = list[Candidate](), [], []
         asked_all, moved_all = found[: len(found) // 2], found[len(found) // 2 :]
         bests = [self._better(*pair) for pair in zip(moved_all, asked_all, strict=True)]
-        around = {} if ground.blind else self._beside(asked_all, bests, before)
-        bests = [around.get(k, best) for k, best in enumerate(bests)]
-        in_their_places = [
-            asked if ground.apart(best, asked) > IN_PLACE_M else best
-            for asked, best in zip(asked_all, bests, strict=True)
-        ]
-        swapped = {} if ground.blind else self._swapped(in_their_places)
+        sure = {} if ground.blind else self._swapped_or_beside(asked_all, bests, before)
         for k, (asked, best) in enumerate(zip(asked_all, bests, strict=True)):
-            if k in swapped or k in around:
-                believed.append(swapped.get(k, best))
+            if k in sure:
+                believed.append(sure[k])
             elif ground.apart(best, asked) > IN_PLACE_M:
                 told = score(best.evidence, ground.blind, ground.parameters.verify)
                 elsewhere.append(best._replace(score=told, in_place=False))
@@ -219,17 +213,19 @@ class InPlace:
                 claims.add(candidate)
         return believed, refused
 
-    def _beside(
+    def _swapped_or_beside(
         self, asked: Sequence[Candidate], bests: Sequence[Candidate], before: Sequence[Candidate]
     ) -> dict[int, Candidate]:
-        """By number of the place what stands beside it, of those that nothing stands in."""
-        ground, found = self._ground, dict[int, Candidate]()
-        empty = [
-            k
-            for k, (place, best) in enumerate(zip(asked, bests, strict=True))
-            if ground.apart(best, place) > IN_PLACE_M or self.why_not(best)
-        ]
-        sound = [best for k, best in enumerate(bests) if k not in empty]
+        """By number of the place what stands in it instead of its own, or beside it where nothing stands in it.
+
+        Swaps come first: a long beam is found beside its place where the ends of a shorter one are.
+        """
+        ground = self._ground
+        far = [ground.apart(best, place) > IN_PLACE_M for place, best in zip(asked, bests, strict=True)]
+        in_place = [place if off else best for place, best, off in zip(asked, bests, far, strict=True)]
+        found = self._swapped(in_place)
+        empty = [k for k, best in enumerate(bests) if k not in found and (far[k] or self.why_not(best))]
+        sound = [found.get(k, best) for k, best in enumerate(bests) if k not in empty]
         others = [*self._standing, *map(self._stands, [*before, *sound])]
         for k in sorted(empty, key=lambda k: -ground.models[asked[k].model].area):  # small ones are drawn to large ones
             if one := self._around(asked[k], bests[k], others):
@@ -302,7 +298,7 @@ class InPlace:
             self._weighing.candidates(each, in_place=True, instead_of=other)[0]
             for each in (refined._replace(hypotheses=start), refined)
         )
-        better = asked if self._ground.apart(found, asked) > IN_PLACE_M else found
+        better = max(asked, found, key=lambda each: explained(each.evidence.spoken))
         return better._replace(instead_of=place)
 
     def why_not(self, candidate: Candidate) -> str:

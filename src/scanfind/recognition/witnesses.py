@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scanfind.design.elements import Element, assigned, elements_of, open_slide, placements_of, said_by
 from scanfind.detection import Detection, Motion
 from scanfind.evidence.ends import Slid, slid, with_faces
-from scanfind.evidence.free_space import ON, Limits, beams_to, caster_of, spoken_by_each, verdicts
+from scanfind.evidence.free_space import ON, Limits, beams_to, caster_of, spoken_by_each, spoken_of, verdicts
 from scanfind.fit.patches import measured
 from scanfind.fit.refine import triple
 from scanfind.pose import Pose
@@ -48,6 +48,7 @@ class Witnesses:
     limits: Limits
     design: Design | None
     _casters: dict[str, RayCaster] = field(default_factory=dict, init=False)
+    _silent: list[tuple[NDArray[np.uint8], float]] = field(default_factory=list, init=False)
 
     def say_by_each(self, model: Model, placed: Pose, *, in_place: bool = False, instead_of: str = "") -> Floats:
         """What each says of a model at a pose relative to the grid's offset, rows as of Spoken, (S, 4), m².
@@ -94,7 +95,32 @@ class Witnesses:
         """The same scanners, where elements stand as in another design."""
         told = replace(self, design=design)
         told._casters.update(self._casters)
+        told._silent.extend(self._silent)
         return told
+
+    def say_of_place(self, model: Model, pose: Pose, is_there: bool) -> Floats:
+        """What each says of a model where the design puts it, as `say_at`; where it was not found, beams that did not
+        come back from there passed through.
+        """
+        said = self.say_at(model, pose)
+        if not is_there:
+            said[:, 2] += self.silent_at(model, pose, said)
+        return said
+
+    def silent_at(self, model: Model, pose: Pose, said: Floats) -> Floats:
+        """The surface of a model at a pose, scans' own frame, from which a beam of each of S scanners should have come
+        back and none did, (S,) m².
+
+        said : (S, 4) of the beams that did, as of `say_at`: so many are silent on any surface, and are left out
+        """
+        if not self._silent:
+            self._silent.extend((np.packbits(each.silent()), each.filled()) for each in self.beams)
+        caster, placed, found = self._caster(model), self._in_grid(pose), []
+        for beams, (packed, filled), came in zip(self.beams, self._silent, said.sum(axis=1), strict=True):
+            into = beams.into_the_open(np.unpackbits(packed, count=len(beams.nearest)).view(np.bool_))
+            through = spoken_of(model, caster, placed, [into], self.limits).through
+            found.append(max(0.0, through - came * (1.0 / max(filled, 1e-6) - 1.0)))
+        return np.array(found)
 
     def elements(self, model: Model, detections: Sequence[Detection], stations: Floats) -> list[Element]:
         """What became of each element of the design that is of a model.
@@ -104,7 +130,9 @@ class Witnesses:
 
         detections : as they are reported; stations : where all of them stood, in order, (S, 3)
         """
-        said = [self.say_at(model, each.design_from_model) for each in placements_of(model)]
+        places = placements_of(model)
+        taken = assigned(model, places, detections)
+        said = [self.say_of_place(model, each.design_from_model, k in taken) for k, each in enumerate(places)]
         return elements_of(model, detections, said, self.numbers(stations))
 
     def with_ends(self, model: Model, detections: Sequence[Detection]) -> dict[int, Detection]:

@@ -41,11 +41,11 @@ EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])
 class Questions(NamedTuple):
     """What the scanners are asked about one tile.
 
-    places : models, by name, and the numbers of their placements
+    places : models, by name, the numbers of their placements, and whether the element was found
     detections : without their points; with where the design has the element each is taken for, if any
     """
 
-    places: list[tuple[str, int]]
+    places: list[tuple[str, int, bool]]
     detections: list[tuple[Detection, Pose | None]]
 
 
@@ -95,15 +95,16 @@ def asked_of_tiles(
 ) -> Mapping[Tile, Questions]:
     """What each tile is asked about models of one size; found : the searches of all tiles for them."""
     asked: dict[Tile, Questions] = defaultdict(lambda: Questions([], []))
+    bare = [replace(one, isolated=None) for one in findings]
     for model in models:
         places = placements_of(model) if job.at_design else ()
-        mine = [replace(one, isolated=None) for one in findings if one.model == model.name]
-        taken = {one.id: places[k].design_from_model for k, one in assigned(model, places, mine).items()}
-        for one in mine:
+        taken = assigned(model, places, bare)
+        designs = {one.id: places[k].design_from_model for k, one in taken.items()}
+        for one in (one for one in bare if one.model == model.name):
             tile = nearest(job, found, model.name, one.scene_from_model)
-            asked[tile].detections.append((one, taken.get(one.id)))
+            asked[tile].detections.append((one, designs.get(one.id)))
         for k, place in enumerate(places):
-            asked[nearest(job, found, model.name, place.design_from_model)].places.append((model.name, k))
+            asked[nearest(job, found, model.name, place.design_from_model)].places.append((model.name, k, k in taken))
     return asked
 
 
@@ -129,8 +130,8 @@ def tell(
     witnesses = Witnesses(grid.beams(), np.array(job.offset), limits, design)
     among = witnesses.among(as_found(job.models(), found)) if job.at_design else witnesses
     said = {
-        (name, k): among.say_at(models[name], placements_of(models[name])[k].design_from_model)
-        for name, k in asked.places
+        (name, k): among.say_of_place(models[name], placements_of(models[name])[k].design_from_model, is_there)
+        for name, k, is_there in asked.places
     }
     detections = {}
     for one, place in asked.detections:
