@@ -218,20 +218,20 @@ class InPlace:
     ) -> dict[int, Candidate]:
         """By number of the place what stands in it instead of its own, or beside it where nothing stands in it.
 
-        Swaps come first: a long beam is found beside its place where the ends of a shorter one are.
+        What is swapped explains more than what stands beside: of a beam that was moved a shorter one explains much.
         """
-        ground = self._ground
+        ground, found = self._ground, dict[int, Candidate]()
         far = [ground.apart(best, place) > IN_PLACE_M for place, best in zip(asked, bests, strict=True)]
         in_place = [place if off else best for place, best, off in zip(asked, bests, far, strict=True)]
-        found = self._swapped(in_place)
-        empty = [k for k, best in enumerate(bests) if k not in found and (far[k] or self.why_not(best))]
-        sound = [found.get(k, best) for k, best in enumerate(bests) if k not in empty]
+        empty = [k for k, best in enumerate(bests) if far[k] or self.why_not(best)]
+        sound = [best for k, best in enumerate(bests) if k not in empty]
         others = [*self._standing, *map(self._stands, [*before, *sound])]
         for k in sorted(empty, key=lambda k: -ground.models[asked[k].model].area):  # small ones are drawn to large ones
             if one := self._around(asked[k], bests[k], others):
                 found[k] = one
                 others.append(self._stands(one))
-        return found
+        carried_off = {k: bests[k] for k in empty if far[k] and not self.why_not(bests[k])}
+        return found | self._swapped(in_place, carried_off | found)
 
     def _stands(self, candidate: Candidate) -> Standing:
         """What is believed, as others are told of it."""
@@ -248,21 +248,23 @@ class InPlace:
         near = self._ground.apart(best, asked) <= IN_PLACE_M and not self._ground.blind
         return asked if near and not self._stands_out(best) else best
 
-    def _swapped(self, bests: Sequence[Candidate]) -> dict[int, Candidate]:
+    def _swapped(self, bests: Sequence[Candidate], beside: Mapping[int, Candidate]) -> dict[int, Candidate]:
         """By number of the place what stands in it, where two elements stand in each other's.
 
-        bests : of the place of each element, what the design has there, as it was found
+        bests : of the place of each element, what the design has there, as it was found; beside : the same farther off
         """
         alike, told = pairs_alike(self._ground.models), []
         stand_ins: dict[tuple[int, int], Candidate | None] = {}
 
         def gain(here: int, there: int) -> float:
             """What share of what is looked at here is explained more where the element of another place stands here."""
-            key, is_there = (here, bests[there].model), bests[here].evidence.spoken
+            key, is_there = (here, bests[there].model), [bests[here], *([beside[here]] if here in beside else [])]
             if key not in stand_ins:
                 stand_ins[key] = self._instead(bests[here], bests[there].model, self._places[here])
             instead = stand_ins[key]
-            return -np.inf if instead is None else more_explained(instead.evidence.spoken, is_there)
+            if instead is None:
+                return -np.inf
+            return min(more_explained(instead.evidence.spoken, each.evidence.spoken) for each in is_there)
 
         for places in combinations(range(len(bests)), 2):
             if tuple(sorted(bests[k].model for k in places)) not in alike:
