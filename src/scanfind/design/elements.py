@@ -58,7 +58,8 @@ class Element:
         turned, symmetry not counted; off_m : how far the point of its surface that moved the most did. None without
         a detection
     on, beside, through, hidden : what beams say at the design's place, as shares of the surface they went to: they
-        ended on it, near it but not on it, behind it, or before it. None where no scanner position is known
+        ended on it, near it but not on it, behind it, or before it; of an element that was not found those that should
+        have come back and did not went behind it. None where no scanner position is known
     why : the evidence in words
     built_from_design : what moves it from its place in the design to where it stands, in the design's axes about their
         origin; without the motions the scan hardly fixes. None unless installed
