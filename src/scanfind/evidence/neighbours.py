@@ -41,7 +41,7 @@ class Design:
         corners = [each.pose.move(each.mesh.vertices) for each in placed]
         self._low, self._high = (np.array([side(some, axis=0) for some in corners]) for side in (np.min, np.max))
         self._names = np.array([each.model for each in placed])
-        self._near: dict[tuple[str, float], NearSurface] = {}
+        self._near: dict[str, NearSurface] = {}
 
     def met(self, model: str, origins: Floats, directions: Floats, ranges: Floats, within: float) -> NDArray[np.bool_]:
         """Which of B beams first met an element that is not of a model, and ended on it, (B,).
@@ -70,8 +70,9 @@ class Design:
             some = np.flatnonzero(near)
             if not len(some):
                 continue
-            apart = np.abs(signed_distances(self._surface(name, mesh, within), pose.inverse().move(points[some]))[0])
-            found[some] = np.fmin(found[some], apart)  # NaN where it is farther
+            surface = self._surface(name, mesh)._replace(reach=within)
+            apart, _ = signed_distances(surface, pose.inverse().move(points[some]))
+            found[some] = np.fmin(found[some], np.abs(apart))  # NaN where it is farther
         return found
 
     def _caster(self) -> RayCaster:
@@ -79,8 +80,8 @@ class Design:
         self._ready = self._ready or RayCaster([(each.mesh, each.pose) for each in self._placed])
         return self._ready
 
-    def _surface(self, name: str, mesh: Mesh, within: float) -> NearSurface:
+    def _surface(self, name: str, mesh: Mesh) -> NearSurface:
         """The surface of a model, made ready when first asked for."""
-        if (name, within) not in self._near:
-            self._near[name, within] = near_triangles(mesh.triangles(), within)
-        return self._near[name, within]
+        if name not in self._near:
+            self._near[name] = near_triangles(mesh.triangles(), 1.0)
+        return self._near[name]
