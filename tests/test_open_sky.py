@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import scanfind
 from scanfind.design.elements import NO_DATA, NOT_FOUND, OCCLUDED
 from scanfind.grid.depth import LEAST_FILLED, Beams
-from scanfind.kernels.grid import NO_BEAM
+from scanfind.kernels.grid import NO_BEAM, RANGE_UNITS
 from scanfind.mesh import Placement
 from scanfind.parameters import PRESETS
 from scanfind.pose import Pose
@@ -55,6 +55,16 @@ def test_a_scanner_is_silent_through_a_window_and_not_where_it_may_not_have_look
     assert looks(beams, turned + 1.2, HIGHEST + 0.1) == (False, False)
     assert looks(beams, turned + 1.2, -0.5) == (False, False)
     assert not (beams.silent() & (beams.nearest < NO_BEAM)).any()
+
+
+def test_silence_reaches_as_far_as_the_scanner_sees() -> None:
+    beams = tower(0.5)
+    silence = beams.silence()
+    assert silence.reach == pytest.approx(5.0, abs=0.01)
+    into = beams.into_the_open(silence)
+    np.testing.assert_array_equal(into.nearest < NO_BEAM, beams.silent())
+    went = (into.nearest[into.nearest < NO_BEAM] >> 16) / RANGE_UNITS
+    np.testing.assert_allclose(went, silence.reach, atol=1e-3)
 
 
 def test_a_sector_that_was_not_scanned_is_not_silent_and_a_thin_scan_says_nothing() -> None:

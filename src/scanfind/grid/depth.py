@@ -15,10 +15,22 @@ DEPTH_PIXELS = 360  # along an edge of the cube map: 0.25° a pixel, 35 mm at 8 
 # they speak of tell (verify.spread). Joined further, a part missing from the scan is taken for one seen through.
 LEAST_SPOKEN, LEAST_DEPTH_PIXELS = 0.08, 45
 ENOUGH_AROUND = 3  # of a pixel and the four beside it must be filled for a sample to be seen through or hidden
-# Beams into the open: of directions towards a surface so many must bring something back for silence to tell; what does
-# not come back went so far; an azimuth is known to a degree; the middle of a pixel (kernels.grid.pack_beam).
-LEAST_FILLED, OPEN_M, AZIMUTHS, PIXELS_MIDDLE = 0.3, 1e4, 360, (128 << 8) | 128
+# Of directions towards a surface so many must bring something back for silence to tell; a scanner sees as far as so
+# many of its beams went; an azimuth is known to a degree; the middle of a pixel (kernels.grid.pack_beam).
+LEAST_FILLED, SEES, AZIMUTHS, PIXELS_MIDDLE = 0.3, 0.99, 360, (128 << 8) | 128
 LOOKED_AT = 45  # patches along an edge, of 2°: one with any range in it was looked at
+
+
+class Silence(NamedTuple):
+    """Where a scanner looked and nothing came back.
+
+    where : (6 · edge² / 8,) uint8, a bit a pixel; filled : how often a surface brings something back (`Beams.filled`)
+    reach : how far the scanner sees, metres
+    """
+
+    where: NDArray[np.uint8]
+    filled: float
+    reach: float
 
 
 class Beams(NamedTuple):
@@ -50,12 +62,21 @@ class Beams(NamedTuple):
         turned |= np.roll(turned, 1) | np.roll(turned, -1)
         return np.asarray(~filled & turned[azimuth] & (elevation >= low) & (elevation <= high))
 
-    def into_the_open(self, silent: NDArray[np.bool_]) -> Beams:
-        """Beams that went on without end where the scanner saw nothing; silent : see there."""
+    def silence(self) -> Silence:
+        """What the scanner did not see though it looked."""
         from scanfind.kernels.grid import NO_BEAM, RANGE_UNITS
 
-        endless = (np.int64(OPEN_M * RANGE_UNITS) << 16) | PIXELS_MIDDLE
-        return Beams(self.origin, np.where(silent, endless, NO_BEAM), self.edge)
+        ranges = (self.nearest[self.nearest < NO_BEAM] >> 16) / RANGE_UNITS
+        reach = float(np.quantile(ranges, SEES)) if len(ranges) else 0.0
+        return Silence(np.packbits(self.silent()), self.filled(), reach)
+
+    def into_the_open(self, silence: Silence) -> Beams:
+        """Beams that went as far as the scanner sees where it saw nothing; silence : its own."""
+        from scanfind.kernels.grid import NO_BEAM, RANGE_UNITS
+
+        silent = np.unpackbits(silence.where, count=len(self.nearest)).view(np.bool_)
+        went = (np.int64(silence.reach * RANGE_UNITS) << 16) | PIXELS_MIDDLE
+        return Beams(self.origin, np.where(silent, went, NO_BEAM), self.edge)
 
     def filled(self) -> float:
         """The share of directions towards a surface that brought a beam back: of patches, that of the upper quarter."""

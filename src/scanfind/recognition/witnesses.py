@@ -20,7 +20,7 @@ from scanfind.pose import Pose
 if TYPE_CHECKING:
     from scanfind.evidence.neighbours import Design
     from scanfind.evidence.rays import RayCaster
-    from scanfind.grid.depth import Beams
+    from scanfind.grid.depth import Beams, Silence
     from scanfind.kernels.distance import NearSurface
     from scanfind.library.model import Model
 
@@ -48,7 +48,7 @@ class Witnesses:
     limits: Limits
     design: Design | None
     _casters: dict[str, RayCaster] = field(default_factory=dict, init=False)
-    _silent: list[tuple[NDArray[np.uint8], float]] = field(default_factory=list, init=False)
+    _silences: list[Silence] = field(default_factory=list, init=False)
 
     def say_by_each(self, model: Model, placed: Pose, *, in_place: bool = False, instead_of: str = "") -> Floats:
         """What each says of a model at a pose relative to the grid's offset, rows as of Spoken, (S, 4), m².
@@ -95,7 +95,7 @@ class Witnesses:
         """The same scanners, where elements stand as in another design."""
         told = replace(self, design=design)
         told._casters.update(self._casters)
-        told._silent.extend(self._silent)
+        told._silences.extend(self._silences)
         return told
 
     def say_of_place(self, model: Model, pose: Pose, is_there: bool) -> Floats:
@@ -113,13 +113,13 @@ class Witnesses:
 
         said : (S, 4) of the beams that did, as of `say_at`: so many are silent on any surface, and are left out
         """
-        if not self._silent:
-            self._silent.extend((np.packbits(each.silent()), each.filled()) for each in self.beams)
+        if not self._silences:
+            self._silences.extend(each.silence() for each in self.beams)
         caster, placed, found = self._caster(model), self._in_grid(pose), []
-        for beams, (packed, filled), came in zip(self.beams, self._silent, said.sum(axis=1), strict=True):
-            into = beams.into_the_open(np.unpackbits(packed, count=len(beams.nearest)).view(np.bool_))
+        for beams, silence, came in zip(self.beams, self._silences, said.sum(axis=1), strict=True):
+            into = beams.into_the_open(silence)
             through = spoken_of(model, caster, placed, [into], self.limits).through
-            found.append(max(0.0, through - came * (1.0 / max(filled, 1e-6) - 1.0)))
+            found.append(max(0.0, through - came * (1.0 / max(silence.filled, 1e-6) - 1.0)))
         return np.array(found)
 
     def elements(self, model: Model, detections: Sequence[Detection], stations: Floats) -> list[Element]:
