@@ -31,6 +31,7 @@ def seen_of(placed: Sequence[tuple[Mesh, Pose]]) -> list[Beams]:
 
 
 def beams_about(points: Floats, origin: Floats) -> Beams:
+    """What a scanner would keep of points it saw, (N, 3)."""
     nearest = np.full(6 * 360**2, NO_BEAM)
     for way in points - origin:
         pixel, packed = pack_beam(*cube_place(*way), 360, float(np.linalg.norm(way)))

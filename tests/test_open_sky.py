@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import scanfind
-from scanfind.design.elements import NO_DATA, NOT_FOUND, OCCLUDED
+from scanfind.design.elements import INSTALLED, NO_DATA, NOT_FOUND, OCCLUDED
 from scanfind.grid.depth import LEAST_FILLED, Beams
 from scanfind.kernels.grid import NO_BEAM, RANGE_UNITS
 from scanfind.mesh import Placement
@@ -85,18 +85,14 @@ def test_what_is_missing_before_the_sky_is_not_found_where_scanners_looked(looke
     places = Placement("low", "IfcBeam", "B1", low), Placement("high", "IfcBeam", "B2", high)
     girder = replace(box(3.0, 0.2, 0.2), name="girder", placements=places)
     ground = blocks("ground", [((-6, -6, -0.3), (8, 6, -0.2))])
-    there = [
-        SceneObject("ground", ground, Pose.identity()),
-        SceneObject("B1", girder, Pose(np.eye(3), np.array([0.0, 0.0, 0.4]))),
-    ]
+    there = [SceneObject("ground", ground, Pose.identity()), SceneObject("B1", girder, low)]
     if looked_up:
         there.append(SceneObject("mast", blocks("mast", [((1.3, 4.0, -0.2), (1.7, 4.4, 9.0))]), Pose.identity()))
     stations = np.array([[-1.0, -3.0, 1.5], [4.0, -2.5, 1.5]])
     cloud = scan(Scene(tuple(there), stations), scanner=Scanner(step=0.003), seed=5).stations
-    told = {
-        each.placement.global_id: each
-        for each in scanfind.find(cloud, girder, parameters=QUICK, at_design=True).elements
-    }
+    elements = scanfind.find(cloud, girder, parameters=QUICK, at_design=True).elements
+    told = {each.placement.global_id: each for each in elements}
+    assert told["low"].status == INSTALLED
     if looked_up:
         assert told["high"].status == NOT_FOUND
         assert told["high"].through is not None

@@ -30,6 +30,7 @@ from scanfind.recognition.candidate import Candidate
 from scanfind.recognition.recognise import Recognition
 from scanfind.search.hypotheses import Hypotheses, model_arrays
 from scanfind.simulate.parts import blocks
+from seen import beams_about
 
 Floats = NDArray[np.float64]
 
@@ -188,7 +189,7 @@ def test_what_beams_say_is_what_plain_rays_say(seed: int) -> None:
     centre = np.array([2.0, 0.0, 0.0]) + rng.uniform(-0.6, 0.6, 3)
     placed = Pose(random_rotation(rng), centre)
     limits = Limits(0.01, 0.05, 0.25)
-    beams = beams_about(np.zeros(3), rng.permutation(points_seen())[:600])
+    beams = beams_about(rng.permutation(points_seen())[:600], np.zeros(3))
     told = spoken_of(box(), caster_of(box()), placed, [beams], limits)
     expected = naive.spoken(placed.move(corners_of(box())), points_of(beams), limits)
     # A beam or two that graze an edge or a limit may go either way.
@@ -200,8 +201,8 @@ def test_moving_everything_changes_nothing_a_beam_says() -> None:
     moved = Pose.from_rotation_vector(np.array([0.3, -1.0, 2.0]), np.array([10.0, -7.0, 3.0]))
     placed, limits = Pose(np.eye(3), np.array([2.1, 0.15, 0.1])), Limits(0.01, 0.05, 0.25)
     points = points_seen()
-    here = spoken_of(box(), caster_of(box()), placed, [beams_about(np.zeros(3), points)], limits)
-    there = beams_about(moved.translation, moved.move(points))
+    here = spoken_of(box(), caster_of(box()), placed, [beams_about(points, np.zeros(3))], limits)
+    there = beams_about(moved.move(points), moved.translation)
     told = spoken_of(box(), caster_of(box()), moved @ placed, [there], limits)
     # Other pixels hold other beams.
     np.testing.assert_allclose(told, here, rtol=0.15, atol=0.006)
@@ -210,7 +211,7 @@ def test_moving_everything_changes_nothing_a_beam_says() -> None:
 
 def test_what_all_scanners_say_is_what_each_says_summed() -> None:
     placed, limits, points = Pose(np.eye(3), np.array([2.1, 0.15, 0.1])), Limits(0.01, 0.05, 0.25), points_seen()
-    scanners = [beams_about(np.zeros(3), points[::2]), beams_about(np.array([0.1, 0.4, 0.0]), points[1::2])]
+    scanners = [beams_about(points[::2], np.zeros(3)), beams_about(points[1::2], np.array([0.1, 0.4, 0.0]))]
     each = spoken_by_each(box(), caster_of(box()), placed, scanners, limits)
     np.testing.assert_allclose(spoken_of(box(), caster_of(box()), placed, scanners, limits), each.sum(axis=0))
     for row, scanner in zip(each, scanners, strict=True):
@@ -220,7 +221,7 @@ def test_what_all_scanners_say_is_what_each_says_summed() -> None:
 
 def test_of_more_beams_than_needed_a_share_says_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     placed, limits = Pose(np.eye(3), np.array([2.1, 0.15, 0.1])), Limits(0.01, 0.05, 0.25)
-    beams = [beams_about(np.zeros(3), points_seen())]
+    beams = [beams_about(points_seen(), np.zeros(3))]
     every = spoken_of(box(), caster_of(box()), placed, beams, limits)
     monkeypatch.setattr("scanfind.evidence.free_space.MOST_BEAMS", 500)
     some = spoken_of(box(), caster_of(box()), placed, beams, limits)
@@ -238,15 +239,6 @@ def test_a_piece_of_scan_is_met_as_the_surface_it_was_cut_from() -> None:
     met = np.isfinite(hits.distance)
     assert met.mean() > 0.35  # between the squares there is nothing to meet
     np.testing.assert_allclose(hits.distance[met], 0.5, rtol=0, atol=0.5 * model.spacing)
-
-
-def beams_about(origin: Floats, points: Floats) -> Beams:
-    """What a scanner would keep of points it saw, (N, 3)."""
-    nearest = np.full(6 * 360**2, NO_BEAM)
-    for way in points - origin:
-        pixel, packed = pack_beam(*cube_place(*way), 360, float(np.linalg.norm(way)))
-        nearest[pixel] = min(nearest[pixel], packed)
-    return Beams(origin, nearest, 360)
 
 
 def points_of(beams: Beams) -> tuple[Floats, Floats]:

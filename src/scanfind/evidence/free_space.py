@@ -87,10 +87,10 @@ def spoken_of(model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[
 
 def spoken_by_each(
     model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams], limits: Limits,
-    design: Design | None = None, offset: Floats | None = None, without: frozenset[str] | None = None,
+    design: Design | None = None, offset: Floats | None = None, instead_of: str = "",
 ) -> Floats:  # fmt: skip
-    """What the beams of each of S scanners say: rows as of `Spoken`, (S, 4), m²; design … without : see `verdicts`."""
-    met = verdicts(model, caster, placed, scanners, limits, design, offset, without)
+    """What the beams of each of S scanners say: rows as of `Spoken`, (S, 4), m²; for the rest see `verdicts`."""
+    met = verdicts(model, caster, placed, scanners, limits, design, offset, instead_of)
     said = [met.says == of for of in (ON, BESIDE, THROUGH, HIDDEN)]
     areas = [np.bincount(met.scanner[each], met.area[each], len(scanners)) for each in said]
     return np.stack(areas, axis=1).astype(np.float64)  # of no beams at all numpy counts integers
@@ -111,11 +111,12 @@ class Verdicts(NamedTuple):
 
 def verdicts(
     model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams], limits: Limits,
-    design: Design | None = None, offset: Floats | None = None, without: frozenset[str] | None = None,
+    design: Design | None = None, offset: Floats | None = None, instead_of: str = "",
 ) -> Verdicts:  # fmt: skip
     """What beams say of a model placed by scene_from_model, relative to the grid's offset, one by one.
 
     design, offset : of a model that is in its place in it, what hides it there; the grid's offset, (3,)
+    instead_of : the model in whose place it stands, which is not there to hide it
     """
     beams, back = towards(model, placed, scanners), placed.inverse()
     origins, directions = back.move(beams.origins), beams.directions @ placed.rotation
@@ -135,7 +136,7 @@ def verdicts(
         some = np.flatnonzero((says == BESIDE) | (says == ON))
         theirs = beams.take(met[some]).moved(np.zeros(3) if offset is None else offset)
         said = of_neighbours(
-            design.off(without or frozenset([model.name]), theirs.ends(), limits.inlier), ranges[some] - distance[some],
+            design.off({model.name, instead_of}, theirs.ends(), limits.inlier), ranges[some] - distance[some],
             cosine[some], says[some], limits.inlier,
         )  # fmt: skip
         says[some] = said

@@ -6,7 +6,7 @@ than free space tells apart.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -53,7 +53,7 @@ class Design:
         off = np.abs(ranges - np.where(first, hits.distance, 0.0)) * hits.cosine
         return np.asarray(first & (off <= within))
 
-    def off(self, without: frozenset[str], points: Floats, within: float) -> Floats:
+    def off(self, without: Set[str], points: Floats, within: float) -> Floats:
         """How far each of N points (N, 3) is from the nearest element, metres; infinite where farther than `within`.
 
         without : models whose elements do not count

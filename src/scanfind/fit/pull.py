@@ -1,4 +1,4 @@
-"""A pose drawn to points from farther away than they are from one another: where they are known to be the model's own.
+"""A pose drawn to points from farther away than ICP on a scene may look: where they are known to be the model's own.
 
 What ICP on the scene cannot do: there the nearest surface is a neighbour's.
 """

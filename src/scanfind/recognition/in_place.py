@@ -290,11 +290,10 @@ class InPlace:
         ways = [pose @ way for way in onto(self._ground.models[model], self._ground.models[stands.model])]
         other = self._ground.models[stands.model].name
         said = [self._weighing.spoken_of(model, way, in_place=True, instead_of=other) for way in ways]
-        explain = [explained(each) for each in said]
-        best = ways[int(np.argmax(explain))]
-        if more_explained(said[int(np.argmax(explain))], stands.evidence.spoken) < -ROUGH_GAIN:
+        best = int(np.argmax([explained(each) for each in said]))
+        if more_explained(said[best], stands.evidence.spoken) < -ROUGH_GAIN:
             return None
-        start = self._ground.placements(model, [best])
+        start = self._ground.placements(model, [ways[best]])
         refined = self._fitted(start, start)
         asked, found = (
             self._weighing.candidates(each, in_place=True, instead_of=other)[0]

@@ -129,18 +129,20 @@ class Sizes:
         """
         elements: dict[str, list[Element]] = {}
         by_ends = {one.id: one for one in detections}
-        every = [(model, search.weighing.witnesses) for search in self.all for model in search.models]
+        asked = [(search.models, search.weighing.witnesses) for search in self.all]
         if at_design:
-            for model, witnesses in every:
-                by_ends |= witnesses.with_ends(model, detections)
+            for models, witnesses in asked:
+                for model in models:
+                    by_ends |= witnesses.with_ends(model, detections)
             stand = as_found(self._models, detections)
-            every = [(model, witnesses.among(stand)) for model, witnesses in every]
+            asked = [(models, witnesses.among(stand)) for models, witnesses in asked]
+        every = {model.name: (model, witnesses) for models, witnesses in asked for model in models}
         found = list(by_ends.values())
         if len(stations) > 1:
-            among = {model.name: (model, witnesses) for model, witnesses in every}
-            found = [among[one.model][1].with_stations(among[one.model][0], one, stations) for one in found]
+            whose = [(one, *every[one.model]) for one in found]
+            found = [witnesses.with_stations(model, one, stations) for one, model, witnesses in whose]
         if at_design:
-            elements = {model.name: witnesses.elements(model, found, stations) for model, witnesses in every}
+            elements = {name: witnesses.elements(model, found, stations) for name, (model, witnesses) in every.items()}
         return found, [element for model in self._models for element in elements.get(model.name, ())]
 
     def noise(self) -> float:

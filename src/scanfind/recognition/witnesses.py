@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scanfind.design.elements import Element, assigned, elements_of, open_slide, placements_of, said_by
 from scanfind.detection import Detection, Motion
 from scanfind.evidence.ends import Slid, slid, with_faces
-from scanfind.evidence.free_space import ON, Limits, beams_to, caster_of, spoken_by_each, spoken_of, verdicts
+from scanfind.evidence.free_space import ON, THROUGH, Limits, beams_to, caster_of, spoken_by_each, spoken_of, verdicts
 from scanfind.fit.patches import measured
 from scanfind.fit.refine import triple
 from scanfind.pose import Pose
@@ -55,8 +55,7 @@ class Witnesses:
 
         in_place : of where the design puts it; instead_of : the model in whose place it stands
         """
-        without = frozenset([model.name, instead_of])
-        return spoken_by_each(model, *self._asks(model, placed, in_place=in_place), without)
+        return spoken_by_each(model, *self._asks(model, placed, in_place=in_place), instead_of)
 
     def met(self, model: Model, placed: Pose) -> tuple[Floats, Floats]:
         """Where beams meet a model as the design puts it, (N, 3) in the scans' own frame, and of how much, (N,) m²."""
@@ -75,8 +74,7 @@ class Witnesses:
         about = np.flatnonzero(measured(surface, placed, ends, 1)[1] >= 0)
         if self.design is not None:
             within = NEIGHBOUR_INLIERS * self.limits.inlier
-            own = frozenset([model.name])
-            about = about[np.isinf(self.design.off(own, ends[about] + self.offset, within))]
+            about = about[np.isinf(self.design.off({model.name}, ends[about] + self.offset, within))]
         return ends[about], areas[about]
 
     def _asks(
@@ -104,7 +102,7 @@ class Witnesses:
         """
         said = self.say_at(model, pose)
         if not is_there:
-            said[:, 2] += self.silent_at(model, pose, said)
+            said[:, THROUGH] += self.silent_at(model, pose, said)
         return said
 
     def silent_at(self, model: Model, pose: Pose, said: Floats) -> Floats:

@@ -239,7 +239,8 @@ class ElementEntry(Entry):
     `detection`: the id of the instance taken for it. `shift_m` of its middle, in the scan's axes, `turn_rad` by what
     angle it is turned, `off_m` how far the point of its surface that moved the most did; all null where it was not
     found. `on`, `beside`, `through`, `hidden`: what beams say at the design's place, as shares of the surface they went
-    to: they ended on it, near it but not on it, behind it, before it; null where no scanner position is known.
+    to: they ended on it, near it but not on it, behind it, before it; where it was not found those that should have
+    come back and did not went behind it; null where no scanner position is known.
     `built_from_design` moves it from its place in the design to where it stands, without the motions the scan hardly
     fixes: null unless it is installed, and in results of an earlier version. `stations`: of the design's place; empty
     where there are not several.

@@ -74,7 +74,7 @@ def all_told(
     tasks = {}
     bare = [replace(one, isolated=None) for one in findings]
     for group, (models, found) in enumerate(zip(by_size(job.models()), searched, strict=True)):
-        for tile, some in asked_of_tiles(job, models, found, findings).items():
+        for tile, some in asked_of_tiles(job, models, found, bare).items():
             limits = found[tile].limits
             tasks[f"tell-{group}-{tile.name()}"] = (tell, job, some, bare, limits, stations, scans)
     said: dict[tuple[str, int], Floats] = {}
@@ -93,14 +93,16 @@ def all_told(
 def asked_of_tiles(
     job: Job, models: Sequence[Model], found: Mapping[Tile, Searched], findings: Sequence[Detection]
 ) -> Mapping[Tile, Questions]:
-    """What each tile is asked about models of one size; found : the searches of all tiles for them."""
+    """What each tile is asked about models of one size.
+
+    found : the searches of all tiles for them; findings : without their points
+    """
     asked: dict[Tile, Questions] = defaultdict(lambda: Questions([], []))
-    bare = [replace(one, isolated=None) for one in findings]
     for model in models:
         places = placements_of(model) if job.at_design else ()
-        taken = assigned(model, places, bare)
+        taken = assigned(model, places, findings)
         designs = {one.id: places[k].design_from_model for k, one in taken.items()}
-        for one in (one for one in bare if one.model == model.name):
+        for one in (one for one in findings if one.model == model.name):
             tile = nearest(job, found, model.name, one.scene_from_model)
             asked[tile].detections.append((one, designs.get(one.id)))
         for k, place in enumerate(places):
