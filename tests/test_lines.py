@@ -211,15 +211,15 @@ def recognition() -> Recognition:
 def test_what_was_found_makes_no_search_longer_and_lines_tell_nothing_of_surface(by_lines: bool) -> None:
     search = recognition().search
     search.round()
-    before, tally = search.chance_missed(), search.tally()
+    before, tally = search.served.chance_missed(), search.tally()
     assert 0.0 < before < 1.0
     search.learn(0, 1, 1.0, by_lines=by_lines)  # all of it shown and hit but once: as hard to find as a thing can be
-    assert search.chance_missed() <= before
+    assert search.served.chance_missed() <= before
     assert (search.tally().hits[0] == 0.0) == by_lines
     assert (search.tally().shown[0] == 0.0) == by_lines
     assert search.tally().tested[0] == tally.tested[0]
     search.learn(0, 50, 0.3, by_lines=by_lines)
-    assert search.chance_missed() < before
+    assert search.served.chance_missed() < before
 
 
 def test_what_a_round_came_to_is_fitted_again_only_when_asked() -> None:

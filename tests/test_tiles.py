@@ -24,7 +24,7 @@ from scanfind.find import find
 from scanfind.grid.moments import ROW, MomentGrid
 from scanfind.scans import open_writer, read_scan, scan_info
 from scanfind.scans.sources import scans_of
-from scanfind.search.surface import RIGHT_PAIR_FINDS, Tally
+from scanfind.search.served import RIGHT_PAIR_FINDS, Tally
 from scanfind.tiles import find_in_tiles
 from scanfind.tiles import plan as planned
 from scanfind.tiles.plan import BASE_BYTES, ROW_BYTES, STATION_BYTES, Held, estimate, size_of, tiles_of

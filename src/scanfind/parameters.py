@@ -48,7 +48,7 @@ PRESETS = {
         pairs=PairParameters(distances=(0.75,), rungs_per_octave=64, angle_cell_deg=12.0),
         search=SearchParameters(
             overlap_ratio=0.15, time_limit_s=20.0, miss_probability=0.0, max_instances=1, facing_only=False,
-            by_shape=False, telling_first=False, each_once=False, by_lines=False,
+            by_shape=False, telling_first=False, each_once=False, by_air=False, by_lines=False,
             normal_length_m=1.0,
         ),
         refine=RefineParameters(coarse_iterations=3, fine_iterations=2, raw_steps=0),

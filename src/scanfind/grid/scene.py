@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from scanfind.cloud import OrientedCloud
 from scanfind.errors import require
+from scanfind.grid.air import Air, air_of
 from scanfind.grid.depth import Beams, DepthMap, joined_until_spoken
 from scanfind.grid.moments import MomentGrid, empty_hash
 from scanfind.grid.surfels import Surfels
@@ -75,6 +76,7 @@ class Scene:
     fine : cells for drawing, verification and ICP, fitted where they are asked for
     coarse : cells of twice the edge, for ICP's first steps; around : of four times, for the shape around a cell
     tolerant : cells for the sequential test, at least four times as large as the fine ones
+    air : cells of the same edge that scanners looked through
     beams : what each known scanner position saw; empty where none is known
     depths : the same as ranges, in pixels joined until they are mostly filled: quick to ask, and at edges wrong
     noise : spread of raw points across the median surfel: the scanner's noise, metres (see `noise_of`)
@@ -85,6 +87,7 @@ class Scene:
     coarse: Surfels
     around: Surfels
     tolerant: OrientationGrid
+    air: Air
     beams: list[Beams]
     depths: list[DepthMap]
     noise: float
@@ -133,8 +136,9 @@ def build_scene(
     tolerant = orientation_grid(coarse.oriented(), 0.5 * test_cell, test_cell)
     beams = grid.beams()
     depths = joined_until_spoken([of.ranges() for of in beams])
+    air = air_of(depths, around.means, test_cell, jobs)
     return Scene(
-        fine, coarse, around, tolerant, beams, depths, noise_of(fine, some(fine)), grid.points, grid.unaddressable
+        fine, coarse, around, tolerant, air, beams, depths, noise_of(fine, some(fine)), grid.points, grid.unaddressable
     )
 
 

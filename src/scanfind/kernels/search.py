@@ -189,13 +189,16 @@ def mark_orientations(means, normals, reach, cell, spread, signed, hash_keys, ha
 
 @kernel
 def lie_on_scene(
-    samples, start, stop, least, rotation, translation, origins, inverse, hash_keys, hash_values, occupied, masks
+    samples, start, stop, least, most, rotation, translation, origins, inverse, hash_keys, hash_values, occupied, masks,
+    air_inverse, air_keys, air_values, air,
 ):  # fmt: skip
     """How many of samples start … stop, placed, lie in cells marked with their normals' directions, in Wald's test.
 
         samples : (N, 6) float32 points and normals
         least : (T+1,) fewer hits after k samples end the test; no more than T are tested
+        most : (T+1,) more samples in the air after k end it too
         origins : (K, 3) scanner positions: samples that face none are passed over, since they cannot tell (K > 0)
+        air_inverse … air : see grid.air; one over the edge of its cells
     Returns hits, and how many samples were tested: -1 where the test ended it. One call for all: with as many arrays a
     call for each sample costs as much as the look-up.
     """
@@ -203,14 +206,25 @@ def lie_on_scene(
     r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
     r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
     t0, t1, t2 = translation[0], translation[1], translation[2]
-    hits = tested = 0
+    hits = tested = in_air = 0
     last = least.shape[0] - 1
     for at in range(start, stop):
         px, py, pz = float(samples[at, 0]), float(samples[at, 1]), float(samples[at, 2])
-        nx, ny, nz = float(samples[at, 3]), float(samples[at, 4]), float(samples[at, 5])
         x = r00 * px + r01 * py + r02 * pz + t0
         y = r10 * px + r11 * py + r12 * pz + t1
         z = r20 * px + r21 * py + r22 * pz + t2
+        cx, cy = np.int64(floor(x * air_inverse)), np.int64(floor(y * air_inverse))
+        cz = np.int64(floor(z * air_inverse))
+        block = find_block(air_keys, air_values, pack_block(cx >> 3, cy >> 3, cz >> 3))
+        if block >= 0 and (air[block, cx & 7] >> np.uint64(((cy & 7) << 3) | (cz & 7))) & np.uint64(1):
+            tested += 1
+            in_air += 1
+            if hits < least[tested] or in_air > most[tested]:
+                return hits, -1
+            if tested == last:
+                break
+            continue
+        nx, ny, nz = float(samples[at, 3]), float(samples[at, 4]), float(samples[at, 5])
         ux, uy, uz = r00 * nx + r01 * ny + r02 * nz, r10 * nx + r11 * ny + r12 * nz, r20 * nx + r21 * ny + r22 * nz
         facing = origins.shape[0] == 0
         for k in range(origins.shape[0]):
@@ -246,7 +260,8 @@ def fetch(points, normals, i, sign, point, normal):
 def test_pairs(
     start, stop, pair_first, pair_second, pair_signs, pair_keys, means, normals,
     offsets, entry_model, entry_first, entry_second, model_starts, model_points, model_normals, samples,
-    length, cell, hash_keys, hash_values, occupied, masks, least_hits, origins, allowed,
+    length, cell, hash_keys, hash_values, occupied, masks, least_hits, most_in_air, origins,
+    air_cell, air_keys, air_values, air, allowed, sought,
 ):  # fmt: skip
     """Test every hypothesis of scene pairs start … stop; returns the best of each pair of each model that pass.
 
@@ -257,9 +272,10 @@ def test_pairs(
     model_starts : (models+1,) where each model's samples begin in model_points, model_normals
     samples : (N, 6) float32, the same points and normals side by side, for the test
     length : metres, of the normals in the four-point sets; 0 for the limit (see pair_pose)
-    least_hits : (T+1,) Wald's test as a table: after k points fewer hits than least_hits[k] end it
+    least_hits, most_in_air : (T+1,) Wald's tests as tables: after k points fewer hits than least_hits[k] end it, or
+        more in the air than most_in_air[k]
     origins : (K, 3) scanner positions: samples that face none of them are passed over; none: all are tested
-    allowed : which poses are worth a test
+    allowed : which poses are worth a test; sought : (models,) which models are
 
     Returns H of them in the order of the pairs: support (H,), the share of hits among the samples tested; model (H,);
     rotation (H, 3, 3); translation (H, 3).
@@ -267,7 +283,7 @@ def test_pairs(
     best_support, best_model = np.empty(64), np.empty(64, np.int64)
     best_rotation, best_translation = np.empty((64, 3, 3)), np.empty((64, 3))
     count = 0
-    inverse = 1.0 / cell
+    inverse, air_inverse = 1.0 / cell, 1.0 / air_cell
     scene, model = np.empty((4, 4)), np.empty((4, 4))
     rotation, translation = np.empty((3, 3)), np.empty(3)
     m1, a1, m2, a2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -280,6 +296,8 @@ def test_pairs(
         frame_of_pair(s1, b1, s2, b2, scene)
         for entry in range(offsets[pair_keys[k]], offsets[pair_keys[k] + 1]):
             which = entry_model[entry]
+            if not sought[which]:
+                continue
             base, n = model_starts[which], model_starts[which + 1] - model_starts[which]
             fetch(model_points, model_normals, base + entry_first[entry], 1.0, m1, a1)
             fetch(model_points, model_normals, base + entry_second[entry], 1.0, m2, a2)
@@ -292,8 +310,8 @@ def test_pairs(
             if not may_be(allowed, which, rotation, translation):
                 continue
             hits, tested = lie_on_scene(
-                samples, base, base + n, least_hits, rotation, translation, origins, inverse, hash_keys, hash_values,
-                occupied, masks,
+                samples, base, base + n, least_hits, most_in_air, rotation, translation, origins, inverse, hash_keys,
+                hash_values, occupied, masks, air_inverse, air_keys, air_values, air,
             )  # fmt: skip
             if tested <= 0 or hits < least_hits[last] * tested / last:
                 continue

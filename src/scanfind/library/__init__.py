@@ -325,6 +325,13 @@ class JointTable(NamedTuple):
     first: NDArray[np.int32]
     second: NDArray[np.int32]
 
+    def entries_of(self, models: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """How many pairs of some models, (models,), have each key, (C,)."""
+        if models.all():
+            return np.diff(self.offsets)
+        before = np.concatenate([[0], np.cumsum(models[self.model], dtype=np.int64)])
+        return np.diff(before[self.offsets])
+
 
 def joint_table(models: Sequence[Model], *, each_once: bool = False) -> JointTable:
     """One hash table for all models, so that a pair of scene points is looked up once (paper 3.4).

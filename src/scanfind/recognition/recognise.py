@@ -39,6 +39,7 @@ Floats = NDArray[np.float64]
 # Without scanner positions: a second instance shows at least this much of what the best one shows (another spool in a
 # shop: 0.61).
 BLIND_SHARE = 0.7
+NAMED = 5  # models in a note
 # A score that none of the poses a model could be taken for reaches: of 218 wrong poses in shops one was above 0.96, of
 # 128 right ones in shops sparse or with half of the object gone 60.
 SURE = 0.98
@@ -91,7 +92,7 @@ class Recognition:
         """Is another round worth it: time left, instances wanted, and the chance of having missed one too high?"""
         limits = self.ground.parameters.search
         if limits.time_limit_s is not None and seconds >= limits.time_limit_s:
-            self._ran_out_of_time = self.search.chance_missed() > limits.miss_probability > 0.0
+            self._ran_out_of_time = self.search.served.chance_missed() > limits.miss_probability > 0.0
             return False
         if limits.miss_probability <= 0.0:
             return self.search.pool_left()
@@ -141,6 +142,7 @@ class Recognition:
             if lines:
                 # What was refused for telling too little may be told by its lines.
                 again = [ground.placements(c.model, [c.pose()]) for c, _ in self._refused]
+                self.search.served.lines_asked(lines.told(len(self.models)))
                 return joined([*again, lines.round()])
             self._of_lines = False
         return self.search.round()
@@ -159,7 +161,7 @@ class Recognition:
         """
         if self._asked:
             self._wanted = self._in_place.wanted()
-            self.search.served(self._wanted <= 0)
+            self.search.served.wanted = self._wanted > 0
             yield from self._in_place.hypotheses()
 
     def progress(self) -> float:
@@ -167,7 +169,7 @@ class Recognition:
         limit = self.ground.parameters.search.miss_probability
         if limit <= 0.0:
             return 0.0
-        return min(1.0, log(max(self.search.chance_missed(), limit)) / log(limit))
+        return min(1.0, log(max(self.search.served.chance_missed(), limit)) / log(limit))
 
     def refine(self, hypotheses: Hypotheses) -> Refined:
         """The best of a round's hypotheses, fitted."""
@@ -230,7 +232,7 @@ class Recognition:
     def _settled(self, claims: Claims) -> None:
         """Where what is believed claims the surface nothing more is drawn."""
         self._refused = closest(self._refused)
-        self.search.served(self._found() >= self._wanted)
+        self.search.served.wanted = self._found() < self._wanted
         self.search.withdraw(claims.marked[self.ground.scene.fine.cells.rows])
 
     def _shown_alike(self, believed: Sequence[Candidate]) -> list[Candidate]:
@@ -328,6 +330,9 @@ class Recognition:
         if self.ground.scene.unaddressable:
             told.append(f"{self.ground.scene.unaddressable} points lie too far from the rest and were left out")
         if self._ran_out_of_time:
-            chance = self.search.chance_missed()
+            chance = self.search.served.chance_missed()
             told.append(f"the time limit ended the search; an instance may have been missed with chance {chance:.0%}")
+        elif too_little := [self.models[k].name for k in np.flatnonzero(self.search.served.unserved()).tolist()]:
+            some = ", ".join(too_little[:NAMED]) + (" …" if len(too_little) > NAMED else "")
+            told.append(f"the scan shows too little of parts of their size to be sure that none was missed: {some}")
         return told

@@ -19,6 +19,7 @@ from scanfind.threads import in_threads
 
 if TYPE_CHECKING:
     from scanfind.cloud import OrientedCloud
+    from scanfind.grid.air import Air
     from scanfind.grid.scene import OrientationGrid
     from scanfind.kernels.allowed import Allowed
     from scanfind.library import JointTable
@@ -31,6 +32,14 @@ Ints = NDArray[np.int64]
 # Bins a pair distance: 380 of them make the shell a partner is sought in (kernels.search.draw_seconds). With six, and
 # 1,600, visiting them cost twice as much as the partners did that are met in vain.
 BINS_A_DISTANCE = 3
+LOST = 0.02  # chance of giving up a right hypothesis that Wald's tests accept
+# Of the samples of a pose that is right within a tenth of the diameter and passes 0.02 hang in the air in the median,
+# 0.2 of one in twenty; of a wrong one 0.4.
+RIGHT_IN_AIR, WRONG_IN_AIR = 0.1, 0.3
+# A round can afford so many models: of more, each has its share. With 200,000 hypotheses for 40 spools only pairs were
+# tested whose feature was drawn once or twice, which is mostly noise: of a spool found alone in its first round not one
+# right hypothesis in five rounds.
+MODELS_A_ROUND = 10
 PARTNERS_COUNTED = 40  # points whose partners are counted, each against all of them
 
 
@@ -105,18 +114,24 @@ class Draws:
         return bins.partners
 
 
-def affordable(pairs: Pairs, table: JointTable, hypotheses: float, *, rarest_first: bool) -> Pairs:
+def affordable(pairs: Pairs, entries: Ints, hypotheses: float, *, rarest_first: bool) -> Pairs:
     """Those of some pairs that a table knows, until their hypotheses are as many as one can afford.
 
+    entries : (cells,) of the table, how many hypotheses a pair leads to by its key
     rarest_first : by how often their feature was drawn: the chance of a pair to be right, over the cost of testing it,
         is one over how often the scene shows its feature
     """
-    cost = (table.offsets[1:] - table.offsets[:-1])[pairs.keys]
+    cost = entries[pairs.keys]
     order = np.flatnonzero(cost > 0)
     if rarest_first:
-        common = np.bincount(pairs.keys, minlength=len(table.offsets) - 1)
+        common = np.bincount(pairs.keys, minlength=len(entries))
         order = order[np.argsort(common[pairs.keys[order]], kind="stable")]
     return pairs.take(order[: np.searchsorted(np.cumsum(cost[order]), hypotheses) + 1])
+
+
+def models_share(models: int) -> float:
+    """How many times the hypotheses of a round so many models need."""
+    return max(1.0, models / MODELS_A_ROUND)
 
 
 class Trial(NamedTuple):
@@ -125,30 +140,36 @@ class Trial(NamedTuple):
     table, arrays : the models' pairs, and the oriented points these are of
     marks : cells of the scene that know which way what is in them faces
     origins : (K, 3) scanner positions: samples that face none are passed over; empty: all are tested
-    least_hits : see `wald_table`; normal_length : metres, see SearchParameters.normal_length_m
-    allowed : which poses are worth a test
+    air : where nothing is
+    least_hits : see `wald_table`; most_in_air : see `air_table`
+    normal_length : metres, see SearchParameters.normal_length_m
+    allowed : which poses are worth a test; sought : (models,) which models are
     """
 
     table: JointTable
     arrays: ModelArrays
     marks: OrientationGrid
     origins: Floats
+    air: Air
     least_hits: Ints
+    most_in_air: Ints
     normal_length: float
     allowed: Allowed
+    sought: NDArray[np.bool_]
 
     def test(self, pairs: Pairs, of: OrientedCloud, jobs: int) -> Hypotheses:
         """The best hypothesis of each pair of each model that pass, best first; of : the points the pairs are of."""
         from scanfind.kernels.search import test_pairs
 
-        table, arrays, marks = self.table, self.arrays, self.marks
+        table, arrays, marks, air = self.table, self.arrays, self.marks, self.air
         passed = in_threads(
             jobs, len(pairs.first),
             lambda start, stop: test_pairs(
                 start, stop, *pairs, of.points, of.normals, table.offsets, table.model, table.first, table.second,
                 arrays.starts, arrays.points, arrays.normals, arrays.samples, self.normal_length, marks.cell,
-                marks.hash_keys, marks.hash_values, marks.occupied, marks.masks, self.least_hits, self.origins,
-                self.allowed,
+                marks.hash_keys, marks.hash_values, marks.occupied, marks.masks, self.least_hits, self.most_in_air,
+                self.origins, *air, self.allowed,
+                self.sought,
             ),
         )  # fmt: skip
         if not passed:
@@ -158,7 +179,7 @@ class Trial(NamedTuple):
         return Hypotheses(models[order], rotations[order], translations[order], support[order])
 
 
-def wald_table(tests: int, right: float, wrong: float, lost: float = 0.02) -> NDArray[np.int64]:
+def wald_table(tests: int, right: float, wrong: float, lost: float = LOST) -> NDArray[np.int64]:
     """Least hits after k = 0 … tests samples below which a hypothesis is given up (Wald's sequential test).
 
     right, wrong : chance of a sample to lie on the scene under a right and a wrong hypothesis; lost : accepted chance
@@ -171,6 +192,13 @@ def wald_table(tests: int, right: float, wrong: float, lost: float = 0.02) -> ND
     # What is left at the end must have the overlap itself, less what chance does to a sample of this size.
     least[-1] = max(least[-1], np.floor(tests * right - 2.0 * np.sqrt(tests * right * (1.0 - right))))
     return np.asarray(least, np.int64)
+
+
+def air_table(tests: int, right: float = RIGHT_IN_AIR, wrong: float = WRONG_IN_AIR) -> NDArray[np.int64]:
+    """Most samples in the air after k = 0 … tests of them beyond which a hypothesis is given up; the same test."""
+    k = np.arange(tests + 1)
+    in_air, not_in_air = log(wrong / right), log((1.0 - right) / (1.0 - wrong))
+    return np.asarray(np.floor((log(1.0 / LOST) + k * not_in_air) / (in_air + not_in_air)), np.int64)
 
 
 class Bins(NamedTuple):

@@ -4,47 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp, log
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.errors import require
+from scanfind.grid.air import no_air
 from scanfind.library.pairs import rungs_of
 from scanfind.priors import Priors
 from scanfind.priors.allowed import NOTHING_KNOWN, allowed_poses
-from scanfind.search.draws import Draws, Trial, affordable, wald_table
+from scanfind.search.draws import Draws, Trial, affordable, air_table, models_share, wald_table
 from scanfind.search.hypotheses import Hypotheses, no_hypotheses
 from scanfind.search.pool import Pool
+from scanfind.search.served import MOST_HYPOTHESES, Served
 
 if TYPE_CHECKING:
     from scanfind.grid.scene import Scene
     from scanfind.library import JointTable
     from scanfind.library.model import Model
     from scanfind.search.hypotheses import ModelArrays
+    from scanfind.search.served import Tally
 
 Floats = NDArray[np.float64]
 
-# What was found first was easier to find than what was not: its rate is halved before it is asked of others.
-LEARNT = 0.5
 ROUNDS_A_POOL = 2  # draw from mostly the same cells, which are fitted then; small parts need others in the long run
-# The first round tells how easily an instance is found, and often finds all there is. Rounds after it: a little more
-# than is missing, and enough to be worth refining; rather a little more in one round than two.
-FIRST_ROUND, ROUND_MARGIN, LEAST_ROUND, MOST_ROUND = 0.3, 1.1, 0.15, 3.0
-# A round can afford so many models: of more, each has its share. With 200,000 hypotheses for 40 spools only pairs were
-# tested whose feature was drawn once or twice, which is mostly noise: of a spool found alone in its first round not one
-# right hypothesis in five rounds.
-MODELS_A_ROUND = 10
 # With so many scanner positions nearly every sample faces one, and asking costs more than it tells.
 FACING_ORIGINS = 6
 # Of the samples that show, so many lie on the scene under a right hypothesis: noise turns normals and moves it. Asked
 # for all of λs, the test refused every right pose of twelve parts that showed 30 %; asked for this, none.
 MEETS = 0.67
-# A pair foreseen to lie on an instance finds it when it does lie there, noise left its feature in the right cell of the
-# hash table, and one of the model's pairs there is near enough: measured 0.03 – 0.5 on spools, 0.013 – 0.06 on frames,
-# less where two thirds are hidden. Only until an instance is found; then it is counted (Search.learn).
-RIGHT_PAIR_FINDS = 0.02
 # Where nothing at all is found, an instance is looked for that shows only half of λs, the paper's own 0.15, for so many
 # full rounds. Of parts that lost 60 to 70 % of their points every one that was found then was found in the first.
 DEEPER, DEEPER_ROUNDS = 0.5, 2.0
@@ -70,6 +59,7 @@ class SearchParameters:
         cost of testing it, is one over how often the scene shows its feature
     each_once : of a model's pairs that its symmetry maps onto one another look up only one: a pipe's pairs are the same
         all around it, and so are the poses they lead to
+    by_air : give up what hangs in the air that beams went through, where scanner positions are known
     by_lines : where nothing is found, look for a model of thin members by these, as lines (see lines)
     normal_length_m : of the normals in the four-point sets (the paper: 1); 0: its limit, the roll alone from normals
     max_tries : places tried for s2 before another s1 is drawn
@@ -90,6 +80,7 @@ class SearchParameters:
     by_shape: bool = True
     telling_first: bool = True
     each_once: bool = True
+    by_air: bool = True
     by_lines: bool = True
     normal_length_m: float = 0.0
     max_tries: int = 1000
@@ -114,19 +105,6 @@ class SearchParameters:
             require(getattr(self, name) >= 1, name, getattr(self, name), "1 or more")
 
 
-class Tally(NamedTuple):
-    """How the search for each of some models went, (models,).
-
-    tested : right pairs tested of an instance that shows λs of its surface, had there been one; inf where no pair is
-        left to draw
-    hits, shown : of the instances found: how often they were hit, and by how many right pairs
-    """
-
-    tested: Floats
-    hits: Floats
-    shown: Floats
-
-
 class Search:
     """The rounds of RANSAC over one scene, for all models together; the same seed gives the same rounds."""
 
@@ -143,17 +121,14 @@ class Search:
         self.rungs = sorted({rung for m in models for rung in rungs_of(m.diameter, m.parameters.pairs)}, reverse=True)
         known = parameters.facing_only and scene.fine.signed and len(scene.depths) <= FACING_ORIGINS
         self._origins = scene.origins() if known else np.empty((0, 3))
+        self._air, self._most_in_air = scene.air if parameters.by_air else no_air(), air_table(parameters.tests)
         # As far as two samples of a model may be off, but never less than the scene's own resampling.
         self._tolerance = max(scene.fine.cell, self.pairs.tolerance * min(model.spacing for model in models))
-        self.rounds, self.effort, self._last_share = 0, 0.0, 1.0
+        self.rounds = 0
         self.pool = Pool(scene, models, by_shape=parameters.by_shape, seed=seed, jobs=jobs)
         self._draws = self._draws_of_pool()
-        self._finds = np.maximum(RIGHT_PAIR_FINDS, learnt or 0.0)
-        self._right, self._last_right = np.zeros(len(models)), np.zeros(len(models))
-        self._served = np.zeros(len(models), np.bool_)  # models of which no further instance is wanted
-        # Of the instances found: hits, and what they showed, in full rounds and in right pairs of one that shows λs.
-        self._learned = np.zeros((len(models), 3))
-        self._by_lines = np.zeros((len(models), 2))  # of those found by lines: hits, and what they showed
+        a_round = parameters.hypotheses_a_round * self._draws.sides * models_share(len(models))
+        self.served = Served(len(models), parameters, MOST_HYPOTHESES / a_round, learnt)
         self._look_for(parameters.overlap_ratio)
 
     def _look_for(self, overlap_ratio: float) -> None:
@@ -169,12 +144,8 @@ class Search:
         if not self.parameters.deeper or self._shown <= deeper or not self.pool_left():
             return False
         self._look_for(deeper)
-        self._until = self.effort + DEEPER_ROUNDS
+        self._until = self.served.effort + DEEPER_ROUNDS
         return True
-
-    def served(self, models: NDArray[np.bool_]) -> None:
-        """Of these models (models,) no further instance is wanted: the search need not go on for them."""
-        self._served = models
 
     def withdraw(self, cells: NDArray[np.bool_]) -> None:
         """Draw no more from these cells (V,): they are explained."""
@@ -185,54 +156,23 @@ class Search:
         return Draws(self.pool.points(), self.pairs, self.rungs, self._tolerance, self.jobs)
 
     def may_stop(self) -> bool:
-        """Is nothing left to draw from, or the chance to have missed an instance of any model below the one allowed?"""
+        """Is nothing left to draw from, or every model served?"""
         if not self.pool_left():
             return True
-        return self.effort >= self._until if self._until else self.chance_missed() < self.parameters.miss_probability
+        return self.served.effort >= self._until if self._until else self.served.enough()
 
     def pool_left(self) -> bool:
         """Is there a pair left to draw?"""
         return self.pool.left()
 
-    def chance_missed(self) -> float:
-        """Chance to have missed an instance that shows λs of its surface, for the model worst served so far."""
-        # Never less than is believed of a model that nobody saw: nothing is searched longer for having been seen.
-        expected = np.maximum(self.effort * self._rate(), self._finds * self._right)
-        expected += believed_of_others(*self._by_lines.T)
-        return exp(-float(expected.min(initial=np.inf, where=~self._served)))
-
     def tally(self) -> Tally:
         """How the search has gone so far."""
-        tested = self._right if self.pool_left() else np.full(len(self.models), np.inf)
-        return Tally(tested, self._learned[:, 0], self._learned[:, 2])
-
-    def _share(self) -> float:
-        """The share of a full round that the next one needs be: as much as is missing."""
-        allowed, missed = self.parameters.miss_probability, self.chance_missed()
-        if allowed == 0.0 or self._until:
-            return 1.0
-        if self.effort == 0.0:
-            return FIRST_ROUND
-        if missed == 1.0:
-            return 1.0
-        needed = self.effort * (log(allowed) / log(missed) - 1.0)
-        return min(MOST_ROUND, max(LEAST_ROUND, ROUND_MARGIN * needed))
+        return self.served.tally(pairs_left=self.pool_left())
 
     def learn(self, model: int, hits: int, support: float, *, by_lines: bool = False) -> None:
-        """Learn from an instance how often the last round hit it: pairs on it go with the square of what it shows.
-
-        by_lines : that was a round of lines (see lines), which tells nothing of surface
-        """
-        shown = (support / self.parameters.overlap_ratio) ** 2
-        if by_lines:
-            self._by_lines[model] += max(hits, 1), shown
-        else:
-            self._learned[model] += max(hits, 1), self._last_share * shown, self._last_right[model] * shown
+        """Learn from an instance how often the last round hit it, see Served.learn."""
+        self.served.learn(model, hits, support, by_lines=by_lines)
         self._look_for(self.parameters.overlap_ratio)  # others are looked for as at first
-
-    def _rate(self) -> Floats:
-        """Hits a full round of an instance of each model that shows λs of its surface, from those found, (models,)."""
-        return believed_of_others(self._learned[:, 0], self._learned[:, 1])
 
     def round(self) -> Hypotheses:
         """One round: draw pairs, look them up, test their hypotheses; the best of each pair and model, best first."""
@@ -240,34 +180,36 @@ class Search:
             self._draws = self._draws_of_pool()
         if len(self.pool) < 2:
             return no_hypotheses()
-        limits, share = self.parameters, self._share()
+        limits, share = self.parameters, 1.0 if self._until else self.served.share()
+        sought = self.served.wanted if self._until else self.served.searched()
         count = round(share * limits.pairs_a_round / len(self.rungs))
         drawn = self._draws.draw(count, self.seed, self.rounds, limits.max_tries)
         # Three of four choices of sides are wrong: as many more hypotheses are tested for the same right pairs.
-        most = share * limits.hypotheses_a_round * self._draws.sides * max(1.0, len(self.models) / MODELS_A_ROUND)
-        tested = affordable(drawn, self.table, most, rarest_first=limits.telling_first)
-        self._expect(count, drawn.keys, tested.keys)
+        most = share * limits.hypotheses_a_round * self._draws.sides * models_share(int(sought.sum()))
+        tested = affordable(drawn, self.table.entries_of(sought), most, rarest_first=limits.telling_first)
         trial = Trial(
             self.table,
             self.arrays,
             self.scene.tolerant,
             self._origins,
+            self._air,
             self._least_hits,
+            self._most_in_air,
             limits.normal_length_m,
             self._allowed,
+            sought,
         )
         self.rounds += 1
-        self.effort += share
-        self._last_share = share
+        self.served.took(share, sought, self._right_pairs(count, drawn.keys, tested.keys))
         return trial.test(tested, self._draws.points, self.jobs)
 
-    def _expect(self, drawn_here: int, drawn: NDArray[np.int64], tested: NDArray[np.int64]) -> None:
-        """Add how many right pairs this round tested of an instance of each model that shows `overlap_ratio`.
+    def _right_pairs(self, drawn_here: int, drawn: NDArray[np.int64], tested: NDArray[np.int64]) -> Floats:
+        """How many right pairs a round tested of an instance of each model that shows `overlap_ratio`, (models,).
 
         drawn_here : pairs at each rung; drawn, tested : keys of those that met a second point, and of those tested
         """
         cells, shown = len(self.table.offsets) - 1, self.parameters.overlap_ratio
-        self._last_right[:] = 0.0
+        right = np.zeros(len(self.models))
         count = np.bincount(drawn, minlength=cells)
         # None of a feature that was not drawn was left out: without this a scan too small for a pair is never done.
         share = np.where(count > 0, np.bincount(tested, minlength=cells) / np.maximum(count, 1), 1.0)
@@ -283,10 +225,5 @@ class Search:
                 shell = 2.0 * model.parameters.pairs.tolerance * model.spacing
                 partners = on_it * len(keys) / samples**2 * 2.0 * self._draws.tolerance / shell
                 second_on_it = partners / max(self._draws.partners(rung), partners, 1e-9)
-                self._last_right[number] += drawn_here * first_on_it * second_on_it * float(share[keys].mean())
-        self._right += self._last_right
-
-
-def believed_of_others(hits: Floats, shown: Floats) -> Floats:
-    """What instances found tell of those that were not: hits for each unit of what was shown, less what was easy."""
-    return np.asarray(LEARNT * hits / np.maximum(shown, 1e-300))
+                right[number] += drawn_here * first_on_it * second_on_it * float(share[keys].mean())
+        return right

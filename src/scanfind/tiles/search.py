@@ -28,7 +28,7 @@ from scanfind.tiles.tasks import Found, Job, design_in, surface_of
 if TYPE_CHECKING:
     from scanfind.evidence.free_space import Limits
     from scanfind.library.model import Model
-    from scanfind.search.surface import Tally
+    from scanfind.search.served import Tally
 
 
 class Searched(NamedTuple):

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.design.elements import placements_of
-from scanfind.search.surface import RIGHT_PAIR_FINDS, Tally, believed_of_others
+from scanfind.search.served import RIGHT_PAIR_FINDS, Tally, believed_of_others
 from scanfind.tiles.plan import Held, Tile, tiles_of
 from scanfind.tiles.search import Owned, Searched, cell_of, middle_in, own, search
 from scanfind.tiles.tasks import Found, Job
