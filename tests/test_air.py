@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from scanfind.cloud import PointChunk
 from scanfind.grid.air import COARSEST_PIXELS, Air, air_of, blocks_about, no_air, pyramids
+from scanfind.grid.blocks import block_table, packed, unpacked
 from scanfind.grid.depth import DepthMap
 from scanfind.grid.moments import MomentGrid
 from scanfind.kernels.air import pixel_beside
-from scanfind.kernels.blocks import find_block, pack_block, unpack_block
+from scanfind.kernels.blocks import block_in, unpack_block
 from scanfind.kernels.grid import cube_pixel
 from scanfind.search.draws import air_table
 
@@ -58,9 +59,9 @@ def air(jobs: int = 1) -> Air:
 def cells_of(air: Air) -> Floats:
     """The middles of all cells of air, (N, 3)."""
     found = []
-    for key, block in zip(air.hash_keys.tolist(), air.hash_values.tolist(), strict=True):
+    for key, block in zip(air.where.hash_keys.tolist(), air.where.hash_values.tolist(), strict=True):
         if key >= 0:
-            bits = np.unpackbits(air.blocks[block].view(np.uint8), bitorder="little")
+            bits = np.unpackbits(air.cells[block].view(np.uint8), bitorder="little")
             at = np.flatnonzero(bits)
             local = np.stack([at >> 6, (at >> 3) & 7, at & 7], axis=1)
             found.append((8 * np.array(unpack_block(key)) + local + 0.5) * air.cell)
@@ -96,26 +97,26 @@ def test_where_something_is_there_is_no_air() -> None:
     found, (_, points) = air(), room()
     for point in points[::500]:
         cell = np.floor(point / found.cell).astype(int)
-        block = find_block(found.hash_keys, found.hash_values, pack_block(*(cell >> 3).tolist()))
+        block = block_in(found.where, *(cell >> 3).tolist())
         x, y, z = (cell & 7).tolist()
         assert block >= 0
-        assert not int(found.blocks[block, x]) >> (8 * y + z) & 1
+        assert not int(found.cells[block, x]) >> (8 * y + z) & 1
 
 
 def test_threads_mark_the_same_air() -> None:
-    np.testing.assert_array_equal(air(2).blocks, air(1).blocks)
+    np.testing.assert_array_equal(air(2).cells, air(1).cells)
 
 
 def test_nobody_knows_of_air_without_a_scanner() -> None:
     for nothing in (air_of([], room()[1], CELL, 1), air_of(room()[0], np.empty((0, 3)), CELL, 1), no_air()):
-        assert len(nothing.blocks) == 0
-        assert find_block(nothing.hash_keys, nothing.hash_values, pack_block(0, 0, 0)) == -1
+        assert len(nothing.cells) == 0
+        assert block_in(nothing.where, 0, 0, 0) == -1
 
 
 def test_where_no_beam_came_back_nothing_is_known() -> None:
     maps, points = room()
     blind = [depth._replace(ranges=np.full_like(depth.ranges, np.inf)) for depth in maps]
-    assert not air_of(blind, points, CELL, 1).blocks.any()
+    assert not air_of(blind, points, CELL, 1).cells.any()
 
 
 def test_a_stray_point_far_away_costs_the_blocks_about_it() -> None:
@@ -143,6 +144,17 @@ def test_coarser_maps_hold_the_nearest_of_the_finer() -> None:
         seen = [ranges[:, start + cube_pixel(*way, edge)] for edge, start in zip(edges, starts, strict=True)]
         assert (np.diff(np.minimum(seen, 1e9), axis=0) <= 0.0).all()
         np.testing.assert_array_equal(seen[0], [depth.ranges[cube_pixel(*way, edges[0])] for depth in maps])
+
+
+@pytest.mark.parametrize("most", [1 << 20, 10])
+def test_blocks_are_found_whether_their_box_is_small_or_large(most: int) -> None:
+    at = np.unique(np.random.default_rng(4).integers(-9, 9, (300, 3)), axis=0)
+    table = block_table(packed(at), most)
+    assert (len(table.places) > 0) == (most > 10)
+    np.testing.assert_array_equal(unpacked(packed(at)), at)
+    number = {tuple(block): k for k, block in enumerate(at.tolist())}
+    for block in np.random.default_rng(5).integers(-12, 12, (3000, 3)).tolist():
+        assert block_in(table, *block) == number.get(tuple(block), -1)
 
 
 # ── Wald's test ──

@@ -14,7 +14,7 @@ from scanfind.cloud import PointChunk
 from scanfind.grid.moments import MomentGrid
 from scanfind.grid.scene import orientation_grid
 from scanfind.grid.surfels import Surfels
-from scanfind.kernels.blocks import find_block, pack_block
+from scanfind.kernels.blocks import block_in, find_block, pack_block
 from scanfind.kernels.search import draw_firsts, draw_seconds, normal_bit
 from scanfind.library.self_similar import cube_turns
 from scanfind.search.draws import BINS_A_DISTANCE, bin_pool, wald_table
@@ -188,7 +188,7 @@ def test_a_surfel_marks_its_own_cell_and_those_along_its_normal(signed: bool) ->
             continue
         for along in (0.0, 0.1, -0.1):
             at = np.floor((mean + along * normal) / 0.2).astype(int)
-            block = find_block(grid.hash_keys, grid.hash_values, pack_block(*(at >> 3).tolist()))
+            block = block_in(grid.where, *(at >> 3).tolist())
             mask = int(grid.masks[block, int((at[0] & 7) << 6 | (at[1] & 7) << 3 | (at[2] & 7))])
             assert block >= 0
             assert mask & int(normal_bit(*normal))

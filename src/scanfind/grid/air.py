@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.grid.moments import empty_hash
+from scanfind.grid.blocks import block_table, packed, unpacked
 from scanfind.threads import in_threads
 
 if TYPE_CHECKING:
     from scanfind.grid.depth import DepthMap
+    from scanfind.kernels.blocks import BlockTable
 
 Floats = NDArray[np.float64]
 
@@ -28,20 +29,18 @@ COARSEST_PIXELS = 45  # along an edge of the cube maps, 2° a pixel: two metres 
 class Air(NamedTuple):
     """Cells that scanners looked through.
 
-    cell : edge, metres
-    hash_keys, hash_values : packed block coordinates → block
-    blocks : (B, 8) uint64, a bit for each of the block's 512 cells
+    cell : edge, metres; where : the blocks
+    cells : (B, 8) uint64, a bit for each of a block's 512 cells
     """
 
     cell: float
-    hash_keys: NDArray[np.int64]
-    hash_values: NDArray[np.int32]
-    blocks: NDArray[np.uint64]
+    where: BlockTable
+    cells: NDArray[np.uint64]
 
 
 def no_air() -> Air:
     """Of a scan by nobody knows whom: no place is known to be empty."""
-    return Air(1.0, *empty_hash(1), np.empty((0, 8), np.uint64))
+    return Air(1.0, block_table(np.empty(0, np.int64)), np.empty((0, 8), np.uint64))
 
 
 def air_of(depths: Sequence[DepthMap], seen: Floats, cell: float, jobs: int) -> Air:
@@ -51,22 +50,19 @@ def air_of(depths: Sequence[DepthMap], seen: Floats, cell: float, jobs: int) -> 
     offset; cell : metres
     """
     from scanfind.kernels.air import mark_air, unmark_air
-    from scanfind.kernels.blocks import fill_hash
 
     if not depths or not len(seen):
         return no_air()
     keys = blocks_about(seen, 8.0 * cell)
-    hash_keys, hash_values = empty_hash(len(keys))
-    fill_hash(keys, np.arange(len(keys)), hash_keys, hash_values)
-    blocks = np.zeros((len(keys), 8), np.uint64)
+    air = Air(cell, block_table(keys), np.zeros((len(keys), 8), np.uint64))
     origins = np.array([depth.origin for depth in depths])
     edges, starts, ranges = pyramids(depths)
     in_threads(
         jobs, len(keys),
-        lambda start, stop: mark_air(start, stop, keys, cell, origins, edges, starts, ranges, blocks),
+        lambda start, stop: mark_air(start, stop, keys, cell, origins, edges, starts, ranges, air.cells),
     )  # fmt: skip
-    unmark_air(seen, cell, hash_keys, hash_values, blocks)
-    return Air(cell, hash_keys, hash_values, blocks)
+    unmark_air(seen, cell, air.where, air.cells)
+    return air
 
 
 def pyramids(depths: Sequence[DepthMap]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
@@ -81,18 +77,9 @@ def pyramids(depths: Sequence[DepthMap]) -> tuple[NDArray[np.int64], NDArray[np.
 
 def blocks_about(points: Floats, edge: float) -> NDArray[np.int64]:
     """Packed coordinates of the blocks of an edge, metres, that points (N, 3) lie in, and of those around them."""
-    from scanfind.kernels.blocks import BIAS
-
-    def packed(at: NDArray[np.int64]) -> NDArray[np.int64]:
-        x, y, z = at.T + BIAS
-        return np.asarray(np.unique((x << 40) | (y << 20) | z))
-
-    def unpacked(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-        return np.stack([keys >> 40, (keys >> 20) & 0xFFFFF, keys & 0xFFFFF], axis=1) - BIAS
-
-    keys = packed(np.floor(points / edge).astype(np.int64))
+    keys = np.unique(packed(np.floor(points / edge).astype(np.int64)))
     for _ in range(BLOCKS_AROUND):
         for axis in np.eye(3, dtype=np.int64):
             at = unpacked(keys)
-            keys = packed(np.concatenate([at - axis, at, at + axis]))
+            keys = np.unique(packed(np.concatenate([at - axis, at, at + axis])))
     return keys

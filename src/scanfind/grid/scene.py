@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,13 @@ from numpy.typing import NDArray
 from scanfind.cloud import OrientedCloud
 from scanfind.errors import require
 from scanfind.grid.air import Air, air_of
+from scanfind.grid.blocks import block_table
 from scanfind.grid.depth import Beams, DepthMap, joined_until_spoken
 from scanfind.grid.moments import MomentGrid, empty_hash
 from scanfind.grid.surfels import Surfels
+
+if TYPE_CHECKING:
+    from scanfind.kernels.blocks import BlockTable
 
 Floats = NDArray[np.float64]
 
@@ -56,15 +60,13 @@ class GridParameters:
 class OrientationGrid(NamedTuple):
     """Coarse cells that know which way the surface in and near them faces: one look-up tests a point of a hypothesis.
 
-    cell : edge, metres
-    hash_keys, hash_values : packed block coordinates → block
-    occupied : (B, 8) uint64, a bit for each of the block's 512 cells that is marked at all
+    cell : edge, metres; where : the blocks
+    occupied : (B, 8) uint64, a bit for each of a block's 512 cells that is marked at all
     masks : (B, 512) uint64, a bit for each of 54 directions (kernels.search.normal_bit)
     """
 
     cell: float
-    hash_keys: NDArray[np.int64]
-    hash_values: NDArray[np.int32]
+    where: BlockTable
     occupied: NDArray[np.uint64]
     masks: NDArray[np.uint64]
 
@@ -202,7 +204,7 @@ def orientation_grid(of: OrientedCloud, reach: float, cell: float) -> Orientatio
         if at == len(of):
             masks = masks[: counts[0]]
             bits = np.packbits(masks != 0, axis=1, bitorder="little").view(np.uint64)
-            return OrientationGrid(cell, hash_keys, hash_values, bits, masks)
+            return OrientationGrid(cell, block_table(block_keys[: counts[0]]), bits, masks)
         room *= 2
         block_keys = np.concatenate([block_keys, np.empty_like(block_keys)])
         masks = np.concatenate([masks, np.empty_like(masks)])

@@ -6,7 +6,7 @@ from math import floor, sqrt
 
 import numpy as np
 
-from scanfind.kernels.blocks import find_block, pack_block, unpack_block
+from scanfind.kernels.blocks import block_in, unpack_block
 from scanfind.kernels.grid import cube_pixel, cube_place
 from scanfind.kernels.jit import kernel
 
@@ -79,13 +79,13 @@ def mark_air(start, stop, block_keys, cell, origins, edges, starts, ranges, air)
 
 
 @kernel
-def unmark_air(points, cell, hash_keys, hash_values, air):
-    """Where points (N, 3) lie there is no air; hash_keys, hash_values : packed block coordinates → row of air."""
+def unmark_air(points, cell, where, air):
+    """Where points (N, 3) lie there is no air; where : the blocks, a BlockTable."""
     inverse = 1.0 / cell
     for n in range(points.shape[0]):
         cx = np.int64(floor(points[n, 0] * inverse))
         cy = np.int64(floor(points[n, 1] * inverse))
         cz = np.int64(floor(points[n, 2] * inverse))
-        block = find_block(hash_keys, hash_values, pack_block(cx >> 3, cy >> 3, cz >> 3))
+        block = block_in(where, cx >> 3, cy >> 3, cz >> 3)
         if block >= 0:
             air[block, cx & 7] &= ~(np.uint64(1) << np.uint64(((cy & 7) << 3) | (cz & 7)))

@@ -6,7 +6,10 @@ A hash rather than a dense table over the site's bounds: a stray point 5,000 km 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from scanfind.kernels.jit import kernel
 
@@ -63,3 +66,29 @@ def fill_hash(block_keys, blocks, keys, values):
     """Store b for block_keys[b], b in blocks; `keys` must come filled with EMPTY and be at least twice as long."""
     for block in blocks:
         insert_block(keys, values, block_keys[block], block)
+
+
+class BlockTable(NamedTuple):
+    """Where the blocks of a sparse grid are: in a dense table of the box they lie in, for one that is looked up a lot.
+
+    low, shape : (3,) int64 the box, in blocks
+    places : (X·Y·Z,) int32, the number of each block in it, -1 where there is none; empty where the box is too large
+    hash_keys, hash_values : packed block coordinates → the same number
+    """
+
+    low: NDArray[np.int64]
+    shape: NDArray[np.int64]
+    places: NDArray[np.int32]
+    hash_keys: NDArray[np.int64]
+    hash_values: NDArray[np.int32]
+
+
+@kernel
+def block_in(where, bx, by, bz):
+    """The number of a block in a BlockTable, -1 where there is none."""
+    if len(where.places) == 0:
+        return find_block(where.hash_keys, where.hash_values, pack_block(bx, by, bz))
+    x, y, z = bx - where.low[0], by - where.low[1], bz - where.low[2]
+    if x < 0 or y < 0 or z < 0 or x >= where.shape[0] or y >= where.shape[1] or z >= where.shape[2]:
+        return np.int64(-1)
+    return np.int64(where.places[(x * where.shape[1] + y) * where.shape[2] + z])

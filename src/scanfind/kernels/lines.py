@@ -6,7 +6,7 @@ from math import ceil
 
 import numpy as np
 
-from scanfind.kernels.blocks import EMPTY, find_block, pack_block, unpack_block
+from scanfind.kernels.blocks import find_block, pack_block, unpack_block
 from scanfind.kernels.jit import kernel
 from scanfind.kernels.search import lie_on_scene
 from scanfind.kernels.surfels import add_moved, smallest_eigenvector, sum_views
@@ -113,16 +113,15 @@ def lines_of_samples(points, reach, count, lines):
 
 @kernel
 def shares_on_scene(
-    start, stop, models, model_starts, samples, rotations, translations, cell, hash_keys, hash_values, occupied, masks,
-    shares,
+    start, stop, models, model_starts, samples, rotations, translations, cell, where, occupied, masks, nowhere, shares,
 ):  # fmt: skip
     """The share of a model's samples, placed, that lie in a cell marked with their direction, for poses start … stop.
 
-    See lie_on_scene; shares : (H,) out
+    See lie_on_scene; nowhere : a table of no block; shares : (H,) out
     """
     inverse, nobody = 1.0 / cell, np.empty((0, 3))
     endless = np.zeros(np.max(model_starts[1:] - model_starts[:-1]) + 1, np.int64)  # no test ends before all are asked
-    nowhere, no_values, no_air = np.full(2, EMPTY), np.zeros(2, np.int32), np.empty((0, 8), np.uint64)
+    no_air = np.empty((0, 8), np.uint64)
     rotation, translation = np.empty((3, 3)), np.empty(3)
     for k in range(start, stop):
         for i in range(3):
@@ -131,7 +130,7 @@ def shares_on_scene(
                 rotation[i, j] = rotations[k, i, j]
         first, end = model_starts[models[k]], model_starts[models[k] + 1]
         hits, _ = lie_on_scene(
-            samples, first, end, endless, endless, rotation, translation, nobody, inverse, hash_keys, hash_values,
-            occupied, masks, 1.0, nowhere, no_values, no_air,
+            samples, first, end, endless, endless, rotation, translation, nobody, inverse, where, occupied, masks, 1.0,
+            nowhere, no_air,
         )  # fmt: skip
         shares[k] = hits / max(end - first, 1)

@@ -7,7 +7,7 @@ from math import cos, floor, pi, sin, sqrt
 import numpy as np
 
 from scanfind.kernels.allowed import may_be
-from scanfind.kernels.blocks import find_block, insert_block, pack_block, unpack_block
+from scanfind.kernels.blocks import block_in, find_block, insert_block, pack_block, unpack_block
 from scanfind.kernels.features import angle_between, feature_key
 from scanfind.kernels.grid import cube_pixel
 from scanfind.kernels.jit import kernel
@@ -189,8 +189,8 @@ def mark_orientations(means, normals, reach, cell, spread, signed, hash_keys, ha
 
 @kernel
 def lie_on_scene(
-    samples, start, stop, least, most, rotation, translation, origins, inverse, hash_keys, hash_values, occupied, masks,
-    air_inverse, air_keys, air_values, air,
+    samples, start, stop, least, most, rotation, translation, origins, inverse, where, occupied, masks, air_inverse,
+    air_where, air,
 ):  # fmt: skip
     """How many of samples start … stop, placed, lie in cells marked with their normals' directions, in Wald's test.
 
@@ -198,7 +198,7 @@ def lie_on_scene(
         least : (T+1,) fewer hits after k samples end the test; no more than T are tested
         most : (T+1,) more samples in the air after k end it too
         origins : (K, 3) scanner positions: samples that face none are passed over, since they cannot tell (K > 0)
-        air_inverse … air : see grid.air; one over the edge of its cells
+        inverse, where, occupied, masks : see grid.scene.OrientationGrid; air_inverse … air : see grid.air
     Returns hits, and how many samples were tested: -1 where the test ended it. One call for all: with as many arrays a
     call for each sample costs as much as the look-up.
     """
@@ -215,7 +215,7 @@ def lie_on_scene(
         z = r20 * px + r21 * py + r22 * pz + t2
         cx, cy = np.int64(floor(x * air_inverse)), np.int64(floor(y * air_inverse))
         cz = np.int64(floor(z * air_inverse))
-        block = find_block(air_keys, air_values, pack_block(cx >> 3, cy >> 3, cz >> 3))
+        block = block_in(air_where, cx >> 3, cy >> 3, cz >> 3)
         if block >= 0 and (air[block, cx & 7] >> np.uint64(((cy & 7) << 3) | (cz & 7))) & np.uint64(1):
             tested += 1
             in_air += 1
@@ -235,7 +235,7 @@ def lie_on_scene(
             continue
         tested += 1
         cx, cy, cz = np.int64(floor(x * inverse)), np.int64(floor(y * inverse)), np.int64(floor(z * inverse))
-        block = find_block(hash_keys, hash_values, pack_block(cx >> 3, cy >> 3, cz >> 3))
+        block = block_in(where, cx >> 3, cy >> 3, cz >> 3)
         if block >= 0:
             local = ((cx & 7) << 6) | ((cy & 7) << 3) | (cz & 7)
             # Most samples of a wrong pose end here, in bits that fit the cache; the masks, 64 times as large, do not.
@@ -260,8 +260,7 @@ def fetch(points, normals, i, sign, point, normal):
 def test_pairs(
     start, stop, pair_first, pair_second, pair_signs, pair_keys, means, normals,
     offsets, entry_model, entry_first, entry_second, model_starts, model_points, model_normals, samples,
-    length, cell, hash_keys, hash_values, occupied, masks, least_hits, most_in_air, origins,
-    air_cell, air_keys, air_values, air, allowed, sought,
+    length, cell, where, occupied, masks, least_hits, most_in_air, origins, air_cell, air_where, air, allowed, sought,
 ):  # fmt: skip
     """Test every hypothesis of scene pairs start … stop; returns the best of each pair of each model that pass.
 
@@ -310,8 +309,8 @@ def test_pairs(
             if not may_be(allowed, which, rotation, translation):
                 continue
             hits, tested = lie_on_scene(
-                samples, base, base + n, least_hits, most_in_air, rotation, translation, origins, inverse, hash_keys,
-                hash_values, occupied, masks, air_inverse, air_keys, air_values, air,
+                samples, base, base + n, least_hits, most_in_air, rotation, translation, origins, inverse, where,
+                occupied, masks, air_inverse, air_where, air,
             )  # fmt: skip
             if tested <= 0 or hits < least_hits[last] * tested / last:
                 continue

@@ -166,10 +166,8 @@ class Trial(NamedTuple):
             jobs, len(pairs.first),
             lambda start, stop: test_pairs(
                 start, stop, *pairs, of.points, of.normals, table.offsets, table.model, table.first, table.second,
-                arrays.starts, arrays.points, arrays.normals, arrays.samples, self.normal_length, marks.cell,
-                marks.hash_keys, marks.hash_values, marks.occupied, marks.masks, self.least_hits, self.most_in_air,
-                self.origins, *air, self.allowed,
-                self.sought,
+                arrays.starts, arrays.points, arrays.normals, arrays.samples, self.normal_length, *marks,
+                self.least_hits, self.most_in_air, self.origins, *air, self.allowed, self.sought,
             ),
         )  # fmt: skip
         if not passed:

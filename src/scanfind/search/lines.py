@@ -162,7 +162,7 @@ class _Window:
             self._jobs, len(shares),
             lambda start, stop: shares_on_scene(
                 start, stop, poses.models, arrays.starts, arrays.samples, poses.rotations, poses.translations,
-                marks.cell, marks.hash_keys, marks.hash_values, marks.occupied, marks.masks, shares,
+                *marks, no_air().where, shares,
             ),
         )  # fmt: skip
         return shares
