@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -78,7 +79,6 @@ class Scene:
     fine : cells for drawing, verification and ICP, fitted where they are asked for
     coarse : cells of twice the edge, for ICP's first steps; around : of four times, for the shape around a cell
     tolerant : cells for the sequential test, at least four times as large as the fine ones
-    air : cells of the same edge that scanners looked through
     beams : what each known scanner position saw; empty where none is known
     depths : the same as ranges, in pixels joined until they are mostly filled: quick to ask, and at edges wrong
     noise : spread of raw points across the median surfel: the scanner's noise, metres (see `noise_of`)
@@ -89,12 +89,16 @@ class Scene:
     coarse: Surfels
     around: Surfels
     tolerant: OrientationGrid
-    air: Air
     beams: list[Beams]
     depths: list[DepthMap]
     noise: float
     points: int
     unaddressable: int
+
+    @cached_property
+    def air(self) -> Air:
+        """Cells as large as the test's that scanners looked through: a fifth of a second, when first asked for."""
+        return air_of(self.depths, self.around.means, self.tolerant.cell, self.fine.jobs)
 
     def origins(self) -> Floats:
         """Scanner positions relative to the grid's offset, (K, 3)."""
@@ -138,9 +142,8 @@ def build_scene(
     tolerant = orientation_grid(coarse.oriented(), 0.5 * test_cell, test_cell)
     beams = grid.beams()
     depths = joined_until_spoken([of.ranges() for of in beams])
-    air = air_of(depths, around.means, test_cell, jobs)
     return Scene(
-        fine, coarse, around, tolerant, air, beams, depths, noise_of(fine, some(fine)), grid.points, grid.unaddressable
+        fine, coarse, around, tolerant, beams, depths, noise_of(fine, some(fine)), grid.points, grid.unaddressable
     )
 
 

@@ -62,7 +62,7 @@ class Surfels:
         """No surfel fitted yet. min_neighbours : see GridParameters; jobs : threads, on which nothing depends."""
         self.cells = number(grid, jobs)
         self.signed = grid.signed
-        self.grid, self._min_neighbours, self._jobs = grid, min_neighbours, jobs
+        self.grid, self._min_neighbours, self.jobs = grid, min_neighbours, jobs
         rows = grid.rows_end()
         self.first_surfel, self.sides = np.zeros(rows, np.int32), np.zeros(rows, np.uint8)
         self.cell_of = np.empty(0, np.int32)
@@ -116,7 +116,7 @@ class Surfels:
             return self
         sides = np.empty(len(some), np.uint8)
         fitted = in_threads(
-            self._jobs, len(some),
+            self.jobs, len(some),
             lambda start, stop: fit_cells(
                 start, stop, some, at.first_cell.searchsorted(some[start], "right") - 1, at.first_cell, at.locals,
                 at.rows, at.order, at.block_keys, at.hash_keys, at.hash_values, at.block_rows, grid.moments, grid.links,

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 ROUNDS_A_POOL = 2  # draw from mostly the same cells, which are fitted then; small parts need others in the long run
+# Of fewer hypotheses most are tested before the air between things is found: the first round of one model, in which it
+# is found if it is there.
+WORTH_AIR = 150_000
 # With so many scanner positions nearly every sample faces one, and asking costs more than it tells.
 FACING_ORIGINS = 6
 # Of the samples that show, so many lie on the scene under a right hypothesis: noise turns normals and moves it. Asked
@@ -121,7 +124,7 @@ class Search:
         self.rungs = sorted({rung for m in models for rung in rungs_of(m.diameter, m.parameters.pairs)}, reverse=True)
         known = parameters.facing_only and scene.fine.signed and len(scene.depths) <= FACING_ORIGINS
         self._origins = scene.origins() if known else np.empty((0, 3))
-        self._air, self._most_in_air = scene.air if parameters.by_air else no_air(), air_table(parameters.tests)
+        self._most_in_air = air_table(parameters.tests)
         # As far as two samples of a model may be off, but never less than the scene's own resampling.
         self._tolerance = max(scene.fine.cell, self.pairs.tolerance * min(model.spacing for model in models))
         self.rounds = 0
@@ -192,7 +195,7 @@ class Search:
             self.arrays,
             self.scene.tolerant,
             self._origins,
-            self._air,
+            self.scene.air if limits.by_air and most >= WORTH_AIR else no_air(),
             self._least_hits,
             self._most_in_air,
             limits.normal_length_m,
