@@ -24,7 +24,7 @@ FIRST_ROUND, ROUND_MARGIN, LEAST_ROUND, MOST_ROUND = 0.3, 1.1, 0.15, 3.0
 # A pair foreseen to lie on an instance finds it when it does lie there, noise left its feature in the right cell of the
 # hash table, and one of the model's pairs there is near enough: in plants 0.09 in the median of spools, 0.07 of valves,
 # headers and frames, less than 0.02 of one in six. Only until an instance is found; then it is counted (Served.learn).
-RIGHT_PAIR_FINDS = 0.05
+RIGHT_PAIR_FINDS = 0.02
 # A model is not waited for that needs more hypotheses than this, some ten seconds of them: a scan whose points are too
 # far apart for a flange shows no more of it for being searched all day.
 MOST_HYPOTHESES = 15e6
