@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from scanfind.grid.air import Air, no_air
@@ -13,6 +14,7 @@ from scanfind.library import JointTable, joint_table
 from scanfind.library.model import Model, build_model
 from scanfind.priors import Priors
 from scanfind.priors.allowed import allowed_poses
+from scanfind.search import surface
 from scanfind.search.draws import Draws, Pairs, Trial, affordable, air_table, wald_table
 from scanfind.search.hypotheses import Hypotheses, model_arrays
 from scanfind.search.pool import Pool
@@ -103,7 +105,8 @@ def test_what_a_pair_costs_is_counted_of_the_models_sought() -> None:
         np.testing.assert_array_equal(table().entries_of(sought), naive)
 
 
-def test_a_model_that_is_served_is_tested_no_more_and_lines_are_counted() -> None:
+def test_a_model_that_is_served_is_tested_no_more_and_lines_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(surface, "MODELS_A_ROUND", 2)
     search = Search(scene(), models(), table(), model_arrays(models()), SearchParameters(), 0, 1)
     search.served.lines_asked(np.array([4.7, 0.0, 4.7]))
     found = search.round()
