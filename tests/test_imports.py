@@ -59,6 +59,11 @@ def test_import_and_help_load_no_array_library() -> None:
     assert not {"numpy", "pydantic", *HEAVY} & set(loaded)
 
 
+def test_the_main_path_loads_kernels_only_when_it_runs() -> None:
+    code = "import sys, scanfind.find, scanfind.inspect; print(*{name.partition('.')[0] for name in sys.modules})"
+    assert not HEAVY & set(_python("-c", code).split())
+
+
 @pytest.mark.parametrize("arguments", [("-c", "import scanfind"), ("-m", "scanfind", "--help")])
 def test_start_is_quick(arguments: tuple[str, ...]) -> None:
     import resource

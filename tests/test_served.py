@@ -10,11 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scanfind.search.served import MOST_ROUND, RIGHT_PAIR_FINDS, Served
+from scanfind.search.served import MODELS_A_ROUND, MOST_ROUND, RIGHT_PAIR_FINDS, Served
 from scanfind.search.surface import SearchParameters
 
 LIMITS = SearchParameters()
 EVERY = np.ones(3, np.bool_)
+FEW, MANY = MODELS_A_ROUND, MODELS_A_ROUND + 1
 NEEDED = -np.log(LIMITS.miss_probability)
 
 
@@ -42,21 +43,28 @@ def test_the_worst_served_of_those_wanted_counts() -> None:
     one = served()
     one.took(1.0, EVERY, np.array([pairs(9.0), pairs(1.0), pairs(3.0)]))
     assert one.chance_missed() == pytest.approx(exp(-1.0))
-    np.testing.assert_array_equal(one.searched(), [False, True, True])
     np.testing.assert_array_equal(one.unserved(), [False, True, True])
     one.wanted = np.array([True, False, True])
     assert one.chance_missed() == pytest.approx(exp(-3.0))
-    np.testing.assert_array_equal(one.searched(), [False, False, True])
     one.wanted = np.array([True, False, False])
     assert one.enough()
-    np.testing.assert_array_equal(one.searched(), [True, False, False])
+
+
+def test_of_many_models_those_not_served_are_searched_and_of_few_all() -> None:
+    for models in (FEW, MANY):
+        one = Served(models, LIMITS, 50.0)
+        short = np.arange(models) < 2
+        one.took(1.0, np.ones(models, np.bool_), np.where(short, pairs(1.0), pairs(9.0)))
+        np.testing.assert_array_equal(one.searched(), short if models == MANY else np.ones(models))
+        one.wanted = ~short  # all served: these go on
+        np.testing.assert_array_equal(one.searched(), ~short)
 
 
 def test_a_round_counts_only_for_those_it_was_for() -> None:
     one = served()
     one.took(1.0, np.array([True, False, True]), np.full(3, pairs(9.0)))
     np.testing.assert_array_equal(one.right, [pairs(9.0), 0.0, pairs(9.0)])
-    np.testing.assert_array_equal(one.searched(), [False, True, False])
+    np.testing.assert_array_equal(one.unserved(), [False, True, False])
 
 
 def test_what_is_out_of_reach_is_not_waited_for_but_told() -> None:
@@ -104,7 +112,7 @@ def test_what_is_found_easily_is_searched_no_longer() -> None:
     one = served()
     one.took(1.0, EVERY, np.full(3, pairs(0.1)))
     one.learn(1, 100, LIMITS.overlap_ratio)
-    np.testing.assert_array_equal(one.searched(), [True, False, True])
+    np.testing.assert_array_equal(one.unserved(), [True, False, True])
     before = one.chance_missed()
     one.learn(0, 1, 1.0)  # all of it shown, and hit but once: nothing is searched longer for that
     assert one.chance_missed() == before
@@ -114,6 +122,6 @@ def test_a_round_of_lines_counts_where_they_tell() -> None:
     one = served()
     one.took(1.0, EVERY, np.full(3, pairs(0.1)))
     one.lines_asked(np.array([4.6, 4.6, 0.0]))
-    np.testing.assert_array_equal(one.searched(), [False, False, True])
+    np.testing.assert_array_equal(one.unserved(), [False, False, True])
     one.learn(2, 40, LIMITS.overlap_ratio, by_lines=True)
     assert one.enough()

@@ -14,11 +14,10 @@ from scanfind.library import JointTable, joint_table
 from scanfind.library.model import Model, build_model
 from scanfind.priors import Priors
 from scanfind.priors.allowed import allowed_poses
-from scanfind.search import surface
+from scanfind.search import served
 from scanfind.search.draws import Draws, Pairs, Trial, affordable, air_table, wald_table
 from scanfind.search.hypotheses import Hypotheses, model_arrays
 from scanfind.search.pool import Pool
-from scanfind.search.served import Served
 from scanfind.search.surface import Search, SearchParameters
 from scanfind.simulate.parts import pipe
 from test_pool import LENGTH, RADIUS, scene
@@ -106,11 +105,10 @@ def test_what_a_pair_costs_is_counted_of_the_models_sought() -> None:
 
 
 def test_a_model_that_is_served_is_tested_no_more_and_lines_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(surface, "MODELS_A_ROUND", 2)
+    monkeypatch.setattr(served, "MODELS_A_ROUND", 2)
     search = Search(scene(), models(), table(), model_arrays(models()), SearchParameters(), 0, 1)
     search.served.lines_asked(np.array([4.7, 0.0, 4.7]))
     found = search.round()
     assert set(found.models.tolist()) == {1}
     assert search.served.right[1] > 0.0
     assert search.served.right[[0, 2]].tolist() == [0.0, 0.0]
-    assert isinstance(search.served, Served)

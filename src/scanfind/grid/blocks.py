@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.grid.moments import empty_hash
-from scanfind.kernels.blocks import BIAS, BlockTable
+
+if TYPE_CHECKING:
+    from scanfind.kernels.blocks import BlockTable
 
 # Of a box of more blocks than this (64 MB) each is looked up by hash, which takes twice as long: one stray point far
 # away must not cost a table of all that lies between.
@@ -15,7 +19,7 @@ MOST_PLACES = 1 << 24
 
 def block_table(keys: NDArray[np.int64], most: int = MOST_PLACES) -> BlockTable:
     """The table of some blocks, numbered in the order of their packed coordinates (B,)."""
-    from scanfind.kernels.blocks import fill_hash
+    from scanfind.kernels.blocks import BIAS, BlockTable, fill_hash
 
     hash_keys, hash_values = empty_hash(len(keys))
     fill_hash(keys, np.arange(len(keys)), hash_keys, hash_values)
@@ -30,10 +34,14 @@ def block_table(keys: NDArray[np.int64], most: int = MOST_PLACES) -> BlockTable:
 
 def packed(at: NDArray[np.int64]) -> NDArray[np.int64]:
     """Packed coordinates (N,) of blocks (N, 3), see kernels.blocks.pack_block."""
+    from scanfind.kernels.blocks import BIAS
+
     x, y, z = at.T + BIAS
     return np.asarray((x << 40) | (y << 20) | z)
 
 
 def unpacked(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     """The coordinates (N, 3) of packed blocks (N,)."""
+    from scanfind.kernels.blocks import BIAS
+
     return np.stack([keys >> 40, (keys >> 20) & 0xFFFFF, keys & 0xFFFFF], axis=1) - BIAS

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.grid.blocks import packed
 from scanfind.grid.moments import empty_hash
 from scanfind.library.pairs import rung_distance
 from scanfind.search.hypotheses import Hypotheses, no_hypotheses
@@ -36,10 +37,6 @@ LOST = 0.02  # chance of giving up a right hypothesis that Wald's tests accept
 # Of the samples of a pose that is right within a tenth of the diameter and passes 0.02 hang in the air in the median,
 # 0.2 of one in twenty; of a wrong one 0.4.
 RIGHT_IN_AIR, WRONG_IN_AIR = 0.1, 0.3
-# A round can afford so many models: of more, each has its share. With 200,000 hypotheses for 40 spools only pairs were
-# tested whose feature was drawn once or twice, which is mostly noise: of a spool found alone in its first round not one
-# right hypothesis in five rounds.
-MODELS_A_ROUND = 10
 PARTNERS_COUNTED = 40  # points whose partners are counted, each against all of them
 
 
@@ -129,11 +126,6 @@ def affordable(pairs: Pairs, entries: Ints, hypotheses: float, *, rarest_first: 
     return pairs.take(order[: np.searchsorted(np.cumsum(cost[order]), hypotheses) + 1])
 
 
-def models_share(models: int) -> float:
-    """How many times the hypotheses of a round so many models need."""
-    return max(1.0, models / MODELS_A_ROUND)
-
-
 class Trial(NamedTuple):
     """What the hypotheses of pairs come from and are tested on.
 
@@ -221,11 +213,10 @@ class Bins(NamedTuple):
 
 def bin_pool(pool: NDArray[np.intp], means: Floats, distance: float, tolerance: float) -> Bins:
     """Sort surfels into cubes, BINS_A_DISTANCE of them a pair distance ± tolerance, metres."""
-    from scanfind.kernels.blocks import BIAS, fill_hash
+    from scanfind.kernels.blocks import fill_hash
 
     points, edge = means[pool], distance / BINS_A_DISTANCE
-    x, y, z = (np.floor(points / edge).astype(np.int64) + BIAS).T
-    keys = (x << 40) | (y << 20) | z
+    keys = packed(np.floor(points / edge).astype(np.int64))
     order = np.argsort(keys, kind="stable")
     bins, starts = np.unique(keys[order], return_index=True)
     starts = np.append(starts, len(pool))

@@ -25,8 +25,9 @@ from scanfind.library import joint_table
 from scanfind.library.pairs import build_pairs, rungs_of
 from scanfind.priors import Priors
 from scanfind.priors.allowed import NOTHING_KNOWN, allowed_poses
-from scanfind.search.draws import Draws, Trial, affordable, air_table, models_share, wald_table
+from scanfind.search.draws import Draws, Trial, affordable, air_table, wald_table
 from scanfind.search.hypotheses import Hypotheses, joined, model_arrays, no_hypotheses
+from scanfind.search.served import models_share
 from scanfind.threads import in_threads
 
 if TYPE_CHECKING:

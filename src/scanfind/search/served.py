@@ -25,9 +25,18 @@ FIRST_ROUND, ROUND_MARGIN, LEAST_ROUND, MOST_ROUND = 0.3, 1.1, 0.15, 3.0
 # hash table, and one of the model's pairs there is near enough: in plants 0.09 in the median of spools, 0.07 of valves,
 # headers and frames, less than 0.02 of one in six. Only until an instance is found; then it is counted (Served.learn).
 RIGHT_PAIR_FINDS = 0.02
+# A round can afford so many models: of more, each has its share. With 200,000 hypotheses for 40 spools only pairs were
+# tested whose feature was drawn once or twice, which is mostly noise: of a spool found alone in its first round not one
+# right hypothesis in five rounds.
+MODELS_A_ROUND = 10
 # A model is not waited for that needs more hypotheses than this, some ten seconds of them: a scan whose points are too
 # far apart for a flange shows no more of it for being searched all day.
 MOST_HYPOTHESES = 15e6
+
+
+def models_share(models: int) -> float:
+    """How many times the hypotheses of a round so many models need."""
+    return max(1.0, models / MODELS_A_ROUND)
 
 
 class Tally(NamedTuple):
@@ -115,9 +124,10 @@ class Served:
         return self._hits(np.maximum(self._efforts, self._most)) < self._needed()
 
     def searched(self) -> Flags:
-        """Which models the next round is for, (models,): of those wanted the ones not served yet, or else all."""
+        """Which models the next round is for, (models,): of many the wanted ones not served yet, else all wanted."""
+        # Of no more than a round affords all are searched, or plants lose what is hard to find (29 of 30 → 27).
         short = self.unserved()
-        return short if short.any() else self.wanted
+        return short if short.any() and len(short) > MODELS_A_ROUND else self.wanted
 
     def share(self) -> float:
         """The part of a full round that the next one needs be: as much as is missing."""

@@ -14,10 +14,10 @@ from scanfind.grid.air import no_air
 from scanfind.library.pairs import rungs_of
 from scanfind.priors import Priors
 from scanfind.priors.allowed import NOTHING_KNOWN, allowed_poses
-from scanfind.search.draws import MODELS_A_ROUND, Draws, Trial, affordable, air_table, models_share, wald_table
+from scanfind.search.draws import Draws, Trial, affordable, air_table, wald_table
 from scanfind.search.hypotheses import Hypotheses, no_hypotheses
 from scanfind.search.pool import Pool
-from scanfind.search.served import MOST_HYPOTHESES, Served
+from scanfind.search.served import MOST_HYPOTHESES, Served, models_share
 
 if TYPE_CHECKING:
     from scanfind.grid.scene import Scene
@@ -184,9 +184,7 @@ class Search:
         if len(self.pool) < 2:
             return no_hypotheses()
         limits, share = self.parameters, 1.0 if self._until else self.served.share()
-        # A round affords ten models: of no more all are searched, or plants lose what is hard to find (29 of 30 → 27).
-        few = len(self.models) <= MODELS_A_ROUND
-        sought = self.served.wanted if self._until or few else self.served.searched()
+        sought = self.served.wanted if self._until else self.served.searched()
         count = round(share * limits.pairs_a_round / len(self.rungs))
         drawn = self._draws.draw(count, self.seed, self.rounds, limits.max_tries)
         # Three of four choices of sides are wrong: as many more hypotheses are tested for the same right pairs.

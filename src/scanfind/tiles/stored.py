@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scanfind.grid.blocks import unpacked
 from scanfind.grid.depth import DEPTH_PIXELS, Beams
 from scanfind.grid.moments import ROW, MomentGrid
 from scanfind.tiles.plan import Tile
@@ -60,10 +61,7 @@ class Store:
 
 def bins_of(keys: Ints, blocks: int) -> Ints:
     """The bins (R, 3) in which blocks lie, from their packed coordinates (R,)."""
-    from scanfind.kernels.blocks import BIAS
-
-    packed = np.stack([keys >> 40, (keys >> 20) & 0xFFFFF, keys & 0xFFFFF], axis=1)
-    return np.asarray((packed - BIAS) >> blocks)
+    return np.asarray(unpacked(keys) >> blocks)
 
 
 def reached(beams: Beams) -> Floats:
