@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from itertools import permutations, product
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,13 +82,16 @@ def self_overlap(points: Floats, normals: Floats, signed: bool, some: int, pose:
     return float(((apart <= reach) & like).any(axis=1).mean())
 
 
-def shift_table(points: Floats, normals: Floats, signed: bool, per_metre: float, reach: Ints) -> Ints:
-    """How often each shift, in cells about the middle of the table, leads from a sample to one of like normal."""
+def shift_table(
+    one: tuple[Floats, Floats], onto: tuple[Floats, Floats], signed: bool, per_metre: float, reach: Ints
+) -> Ints:
+    """How often each shift, in cells about the middle of the table, leads from a point to another of like normal."""
     table = np.zeros(2 * reach + 1, np.int64)
-    for i, j in permutations(range(len(points)), 2):
-        along = float(normals[i] @ normals[j])
-        if (along if signed else abs(along)) > 0.9:
-            table[tuple(reach + np.round((points[i] - points[j]) * per_metre).astype(np.int64))] += 1
+    for point, normal in zip(*one, strict=True):
+        for other, facing in zip(*onto, strict=True):
+            along = float(normal @ facing)
+            if (along if signed else abs(along)) > 0.9:
+                table[tuple(reach + np.round((other - point) * per_metre).astype(np.int64))] += 1
     return table
 
 

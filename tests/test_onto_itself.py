@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from naive import self_overlap, shift_table
 from scanfind.kernels import overlap
+from scanfind.library.self_similar import highest_around
 from scanfind.pose import Pose, random_rotation
 
 Floats = NDArray[np.float64]
@@ -34,11 +35,24 @@ def test_overlap_equals_all_against_all(seed: int, count: int, signed: bool) -> 
 
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 40), signed=st.booleans())
 @settings(max_examples=50, deadline=None)
-def test_shifts_are_counted_there_and_back(seed: int, count: int, signed: bool) -> None:
-    points, normals = samples(np.random.default_rng(seed), count)
+def test_shifts_equal_all_against_all_and_of_no_turn_lead_there_and_back(seed: int, count: int, signed: bool) -> None:
+    rng = np.random.default_rng(seed)
+    onto, facing = samples(rng, count)
     cell = 0.07
-    reach = np.ceil(np.ptp(points, axis=0) / cell).astype(np.int64) + 1
-    table = np.zeros(2 * reach + 1, np.int64)
-    overlap.count_shifts(points, normals, signed, 1.0 / cell, reach, table)
-    np.testing.assert_array_equal(table, shift_table(points, normals, signed, 1.0 / cell, reach))
-    np.testing.assert_array_equal(table, table[::-1, ::-1, ::-1])
+    for turn in (np.eye(3), random_rotation(rng)):
+        points, normals = onto @ turn.T, facing @ turn.T
+        farthest = np.maximum(onto.max(axis=0) - points.min(axis=0), points.max(axis=0) - onto.min(axis=0))
+        reach = np.ceil(farthest / cell).astype(np.int64) + 1
+        table = np.zeros(2 * reach + 1, np.int64)
+        overlap.count_shifts(points, normals, onto, facing, signed, 1.0 / cell, reach, table)
+        np.testing.assert_array_equal(table, shift_table((points, normals), (onto, facing), signed, 1.0 / cell, reach))
+        assert turn[0, 0] != 1.0 or (table == table[::-1, ::-1, ::-1]).all()
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_the_highest_around_a_cell_is_that_of_27(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    table = rng.integers(0, 9, rng.integers(1, 7, 3))
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(table, 1), (3, 3, 3))
+    np.testing.assert_array_equal(highest_around(table), windows.max(axis=(3, 4, 5)))

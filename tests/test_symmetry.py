@@ -330,13 +330,25 @@ def test_a_rack_could_be_taken_for_itself_one_bay_on() -> None:
     posts = [((bay * k, y, 0), (bay * k + 0.05, y + 0.05, 1)) for k in range(bays + 1) for y in (0, 0.4)]
     rungs = [((bay * k, 0, 0.5), (bay * k + 0.05, 0.45, 0.55)) for k in range(bays + 1)]
     rack = itself(moved(blocks("rack", [*posts, *rungs]), SOMEWHERE))
-    found = similar_to(rack)
+    found, symmetry = similar_to(rack), find_symmetry(rack)
     along = SOMEWHERE.turn(np.array([[1.0, 0, 0]]))[0]
-    # Those that a half turn leads to are not tried again.
-    shifts = [each.motion.translation @ along for each in found if each.motion.difference(Pose.identity())[1] < 0.02]
     assert all(each.overlap >= LEAST_OVERLAP for each in found)
     for expected in (-2 * bay, -bay, bay, 2 * bay):
-        assert min(abs(shift - expected) for shift in shifts) < 0.01
+        # A half turn is a symmetry of it: what that leads to is the same.
+        motion = Pose(np.eye(3), expected * along)
+        assert min(pose_error(each.motion, motion, symmetry).translation_m for each in found) < 0.01
+
+
+@pytest.mark.parametrize("pose", [Pose.identity(), SOMEWHERE], ids=["as drawn", "moved"])
+def test_a_header_could_be_taken_for_itself_end_for_end_by_its_ends_or_by_its_branches(pose: Pose) -> None:
+    length, off = 2.0, 0.15
+    pieces = [((0.0, 0.0, 0.0), (length, 0.16, 0.16))]
+    pieces += [((x, 0.03, 0.16), (x + 0.1, 0.13, 0.5)) for x in (0.5, length - off - 0.6)]
+    found = similar_to(itself(moved(blocks("header", pieces), pose)))
+    as_drawn = [pose.inverse() @ each.motion @ pose for each in found]
+    ends = [motion.translation[0] for motion in as_drawn if motion.rotation[2, 2] > 0.99]  # where the near end goes
+    for expected in (length, length - off):
+        assert min(abs(end - expected) for end in ends) < 0.01, ends
 
 
 def test_a_beam_that_slides_along_itself_repeats_nothing() -> None:

@@ -25,17 +25,20 @@ def self_overlap(points, normals, signed, some, rotation, translation, reach):
 
 
 @kernel
-def count_shifts(points, normals, signed, per_metre, reach, table):
-    """Count, in cells of a table (2 a + 1, 2 b + 1, 2 c + 1), the shifts that lead from a sample to one of like normal.
+def count_shifts(points, normals, onto, onto_normals, signed, per_metre, reach, table):
+    """Count, in cells of a table (2 a + 1, 2 b + 1, 2 c + 1), the shifts from a point to another of like normal.
 
     per_metre : cells a metre; reach : (a, b, c), the cell of no shift
     """
     for i in range(points.shape[0]):
-        for j in range(i):
-            along = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
+        for j in range(onto.shape[0]):
+            along = (
+                normals[i, 0] * onto_normals[j, 0]
+                + normals[i, 1] * onto_normals[j, 1]
+                + normals[i, 2] * onto_normals[j, 2]
+            )
             if (along if signed else abs(along)) > 0.9:
-                u = int(round((points[i, 0] - points[j, 0]) * per_metre))
-                v = int(round((points[i, 1] - points[j, 1]) * per_metre))
-                w = int(round((points[i, 2] - points[j, 2]) * per_metre))
+                u = int(round((onto[j, 0] - points[i, 0]) * per_metre))
+                v = int(round((onto[j, 1] - points[i, 1]) * per_metre))
+                w = int(round((onto[j, 2] - points[i, 2]) * per_metre))
                 table[reach[0] + u, reach[1] + v, reach[2] + w] += 1
-                table[reach[0] - u, reach[1] - v, reach[2] - w] += 1

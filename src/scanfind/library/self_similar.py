@@ -29,6 +29,10 @@ ALIKE = 1.0 / 15.0
 # The table of shifts: samples paired, its cell in spacings of these, and most cells to either side of none.
 SHIFT_SAMPLES, SHIFT_CELL, SHIFT_CELLS = 1500, 2.0, 30
 MOST_SHIFTS = 20
+# After a turn: samples paired, shifts tried, and the least overlap (with less, each spool had five more, none of which
+# is a pose that anything was taken for). Most are hopeless, and a few samples show it.
+TURNED_SAMPLES, MOST_TURNED, LEAST_TURNED, TURNED_DIP = 400, 6, 0.5, 0.93
+FEW, FEW_SHARE = 40, 0.7
 # A repetition: so many spacings to either side of it, the model lies on itself clearly less.
 SHIFT_FLANK, SHIFT_DIP = 4.0, 0.9
 
@@ -44,14 +48,18 @@ def find_similar(model: OntoItself, symmetry: Symmetry) -> tuple[Similar, ...]:
     """Motions that bring at least `LEAST_OVERLAP` of the samples onto samples and are no symmetry, best first.
 
     Tried are the turns of a cube about the middle of the model's box, along its own axes, its largest plane faces and
-    its principal axes, and the shifts by which the model repeats itself (the bays of a rack).
+    its principal axes; the shifts by which the model repeats itself (the bays of a rack); and both together.
     """
     kept = [Similar(1.0, Pose.identity())]
 
     def is_new(motion: Pose) -> bool:
         return all(_differ(model, motion, other.motion, symmetry) for other in kept)
 
-    proposed = [Similar(model.overlap(motion), motion) for motion in [*_turned(model), *_shifted(model)]]
+    drawn, motions = _drawn_along(model), list(_shifted(model))
+    for axes in drawn:
+        motions += [*_turned(model, axes), *_turned_and_shifted(model, axes)]
+    motions += _turned(model, _principal(model))
+    proposed = [Similar(model.overlap(motion), motion) for motion in motions]
     for rough in sorted(proposed, key=lambda each: -each.overlap):
         if rough.overlap >= LEAST_OVERLAP and is_new(rough.motion):
             motion = model.settled(rough.motion)
@@ -66,18 +74,27 @@ def _differ(model: OntoItself, one: Pose, other: Pose, symmetry: Symmetry) -> bo
     return error.translation_m + model.radius * error.rotation_rad > ALIKE * model.diameter
 
 
-def _turned(model: OntoItself) -> Iterator[Pose]:
-    """Turns of a cube along the model's own axes, those of its largest plane faces, and its principal ones."""
-    principal = np.linalg.svd(model.points - model.centre, full_matrices=False)[2]
+def _turned(model: OntoItself, axes: Floats) -> Iterator[Pose]:
+    """Turns of a cube along axes (3, 3), as rows, about the middle of the model's box along these."""
+    along = model.points @ axes.T
+    middle = 0.5 * (along.min(axis=0) + along.max(axis=0)) @ axes
+    for turn in cube_turns()[1:]:
+        rotation = axes.T @ turn @ axes
+        yield Pose(rotation, middle - rotation @ middle)
+
+
+def _drawn_along(model: OntoItself) -> list[Floats]:
+    """The model's own axes, and those of its largest plane faces where these are others: (3, 3) each, as rows."""
     faced = _faced(model)
     square = (np.abs(faced) > SQUARE).any(axis=1).all()  # to the model's own axes
-    for axes in (np.eye(3), principal) if square else (np.eye(3), faced, principal):
-        axes[2] = np.cross(axes[0], axes[1])
-        along = model.points @ axes.T
-        middle = 0.5 * (along.min(axis=0) + along.max(axis=0)) @ axes
-        for turn in cube_turns()[1:]:
-            rotation = axes.T @ turn @ axes
-            yield Pose(rotation, middle - rotation @ middle)
+    return [np.eye(3)] if square else [np.eye(3), faced]
+
+
+def _principal(model: OntoItself) -> Floats:
+    """The principal axes, (3, 3), as rows."""
+    axes = np.linalg.svd(model.points - model.centre, full_matrices=False)[2]
+    axes[2] = np.cross(axes[0], axes[1])
+    return np.asarray(axes)
 
 
 def _faced(model: OntoItself) -> Floats:
@@ -91,11 +108,13 @@ def _faced(model: OntoItself) -> Floats:
 
 
 def _shifted(model: OntoItself) -> Iterator[Pose]:
-    """Shifts, there and back, at which the model lies on itself clearly better than a little farther or nearer, and
-    no worse than a little aside: a beam slides along itself as well, and no place there is better than the next.
+    """Shifts at which the model lies on itself clearly better than a little farther or nearer, and no worse than a
+    little aside: a beam slides along itself as well, and no place there is better than the next.
     """
-    for shift in _shifts(model):
-        here, step = model.overlap(shifted(shift)), SHIFT_FLANK * model.spacing
+    step = SHIFT_FLANK * model.spacing
+    far = max(ALIKE * model.diameter, 2.0 * step)
+    for shift in _shifts(model, np.eye(3), np.eye(3), SHIFT_SAMPLES, far)[:MOST_SHIFTS]:
+        here = model.overlap(shifted(shift))
         if here < LEAST_OVERLAP:
             continue
         ends = [model.overlap(shifted(shift + side * step * unit(shift))) for side in (-1, 1)]
@@ -105,23 +124,58 @@ def _shifted(model: OntoItself) -> Iterator[Pose]:
             yield shifted(-shift)
 
 
-def _shifts(model: OntoItself) -> Floats:
-    """The likeliest, (K, 3): peaks of how often each shift leads from a sample to one of like normal."""
+def _turned_and_shifted(model: OntoItself, axes: Floats) -> Iterator[Pose]:
+    """Turns of a cube along axes (3, 3), as rows, and shifts after which the model lies on itself clearly better than
+    a little aside: a header turned end for end has its branches elsewhere, and lies on itself where these do as well
+    as where its ends do.
+    """
+    step = SHIFT_FLANK * model.spacing
+    for turn in cube_turns()[1:]:
+        rotation = axes.T @ turn @ axes
+        for shift in _shifts(model, axes, turn, TURNED_SAMPLES, 0.0)[:MOST_TURNED]:
+            motion = Pose(rotation, model.centre + shift - rotation @ model.centre)
+            if model.overlap(motion, FEW) < FEW_SHARE * LEAST_TURNED:
+                continue
+            motion = model.settled(motion)
+            if (here := model.overlap(motion)) < LEAST_TURNED:
+                continue
+            aside = (model.overlap(shifted(side * step * axis) @ motion) for axis in axes for side in (-1, 1))
+            if all(each < TURNED_DIP * here for each in aside):
+                yield motion
+
+
+def _shifts(model: OntoItself, axes: Floats, turn: Floats, most: int, far: float) -> Floats:
+    """The likeliest after a turn along axes (3, 3), about the model's middle, (K, 3), best first: peaks of how often
+    each shift leads from a sample to one of like normal.
+
+    most : samples paired; far : shorter ones are none, metres
+    """
     from scanfind.kernels.overlap import count_shifts
 
-    count = min(SHIFT_SAMPLES, len(model.points))
-    points, normals = model.points[:count], model.normals[:count]
-    extent = np.ptp(points, axis=0)
-    cell = max(SHIFT_CELL * model.spacing * np.sqrt(len(model.points) / count), extent.max() / SHIFT_CELLS)
-    reach = np.ceil(extent / cell).astype(np.int64) + 1
+    count = min(most, len(model.points))
+    onto, facing = (model.points[:count] - model.centre) @ axes.T, model.normals[:count] @ axes.T
+    points, normals = onto @ turn.T, facing @ turn.T
+    farthest = np.maximum(onto.max(axis=0) - points.min(axis=0), points.max(axis=0) - onto.min(axis=0))
+    cell = max(SHIFT_CELL * model.spacing * np.sqrt(len(model.points) / count), farthest.max() / SHIFT_CELLS)
+    reach = np.ceil(farthest / cell).astype(np.int64) + 1
     table = np.zeros(2 * reach + 1, np.int64)
-    count_shifts(points, normals, model.signed, 1.0 / cell, reach, table)
-    highest_around = np.lib.stride_tricks.sliding_window_view(np.pad(table, 1), (3, 3, 3)).max(axis=(3, 4, 5))
-    peaks = np.argwhere((table == highest_around) & (table > 0))
+    count_shifts(points, normals, onto, facing, model.signed, 1.0 / cell, reach, table)
+    peaks = np.argwhere((table == highest_around(table)) & (table > 0))
     shifts = (peaks - reach) * cell
-    far = np.linalg.norm(shifts, axis=1) > max(ALIKE * model.diameter, 2 * SHIFT_FLANK * model.spacing)
-    best = np.argsort(-table[tuple(peaks.T)] * far, kind="stable")[:MOST_SHIFTS]
-    return np.asarray(shifts[best[far[best]]])
+    best = np.argsort(-table[tuple(peaks.T)], kind="stable")
+    return np.asarray(shifts[best[np.linalg.norm(shifts[best], axis=1) >= far]] @ axes)
+
+
+def highest_around(table: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The highest of each cell of a table (A, B, C) and its 26 neighbours."""
+    for axis in range(3):
+        one, two = [slice(None)] * 3, [slice(None)] * 3
+        one[axis], two[axis] = slice(1, None), slice(None, -1)
+        highest = table.copy()
+        np.maximum(highest[tuple(one)], table[tuple(two)], out=highest[tuple(one)])
+        np.maximum(highest[tuple(two)], table[tuple(one)], out=highest[tuple(two)])
+        table = highest
+    return table
 
 
 def shifted(shift: Floats) -> Pose:

@@ -127,7 +127,7 @@ class Recognition:
         found nothing, of lines, once and again as long as these find something.
         """
         self._of_lines = self._lines_find or (
-            self._untried() and bool(self.search.rounds or not self.search.pool_left())
+            self._untried() and bool(self.search.choices or not self.search.pool_left())
         )
         if self._lines_find and self.weighing.lines:
             return self._elsewhere(self.weighing.lines.round())

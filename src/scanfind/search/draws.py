@@ -165,8 +165,7 @@ class Trial(NamedTuple):
         if not passed:
             return no_hypotheses()
         support, models, rotations, translations = (np.concatenate(column) for column in zip(*passed, strict=True))
-        order = np.argsort(-support, kind="stable")
-        return Hypotheses(models[order], rotations[order], translations[order], support[order])
+        return Hypotheses(models, rotations, translations, support).best_first()
 
 
 def wald_table(tests: int, right: float, wrong: float, lost: float = LOST) -> NDArray[np.int64]:

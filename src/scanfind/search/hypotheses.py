@@ -31,7 +31,7 @@ class ModelArrays(NamedTuple):
 
 
 class Hypotheses(NamedTuple):
-    """H poses of models, the best first.
+    """H poses of models, mostly the best first.
 
     models : (H,) int64; rotations (H, 3, 3), translations (H, 3) : scene_from_model, relative to the grid's offset
     support : (H,) share of the test's samples on the scene
@@ -45,6 +45,10 @@ class Hypotheses(NamedTuple):
     def take(self, which: NDArray[np.intp]) -> Hypotheses:
         """Some of them."""
         return Hypotheses(self.models[which], self.rotations[which], self.translations[which], self.support[which])
+
+    def best_first(self) -> Hypotheses:
+        """The same by their support; of equal ones the earlier is first."""
+        return self.take(np.argsort(-self.support, kind="stable"))
 
 
 def model_arrays(models: Sequence[Model]) -> ModelArrays:

@@ -79,7 +79,7 @@ class Pool:
 
     def refilled(self, number: int) -> bool:
         """Choose again where cells were withdrawn since the last time; number : see `fill`."""
-        if stale := self._stale:
+        if stale := self._stale or number != self._number:
             self.fill(number)
         return stale
 
@@ -105,7 +105,7 @@ class Pool:
         self._kept = np.minimum(1.0, usable / np.maximum(there, 1))
         self._kept_bulges = np.ones(len(BULGE_BORDERS) + 1)
         self.surfels = self._thinned(surfels, number) if self._by_shape else surfels
-        self._stale = False
+        self._stale, self._number = False, number
 
     def points(self) -> OrientedCloud:
         """The surfels as oriented points, relative to the grid's offset."""

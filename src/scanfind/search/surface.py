@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import ceil
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +16,7 @@ from scanfind.library.pairs import rungs_of
 from scanfind.priors import Priors
 from scanfind.priors.allowed import NOTHING_KNOWN, allowed_poses
 from scanfind.search.draws import Draws, Trial, affordable, air_table, wald_table
-from scanfind.search.hypotheses import Hypotheses, no_hypotheses
+from scanfind.search.hypotheses import Hypotheses, joined, no_hypotheses
 from scanfind.search.pool import Pool
 from scanfind.search.served import MOST_HYPOTHESES, Served, models_share
 
@@ -28,7 +29,9 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-ROUNDS_A_POOL = 2  # draw from mostly the same cells, which are fitted then; small parts need others in the long run
+# Full rounds that draw from one choice of surfels: of a part far away the few in it make forty pairs, and drawing these
+# twenty times over found nothing (of three such spools and headers in a plant none, with new choices two).
+A_CHOICE = 2.0
 # Of fewer hypotheses most are tested before the air between things is found: the first round of one model, in which it
 # is found if it is there.
 WORTH_AIR = 150_000
@@ -127,7 +130,7 @@ class Search:
         self._most_in_air = air_table(parameters.tests)
         # As far as two samples of a model may be off, but never less than the scene's own resampling.
         self._tolerance = max(scene.fine.cell, self.pairs.tolerance * min(model.spacing for model in models))
-        self.rounds = 0
+        self.choices = 0  # of surfels that were drawn from
         self.pool = Pool(scene, models, by_shape=parameters.by_shape, seed=seed, jobs=jobs)
         self._draws = self._draws_of_pool()
         a_round = parameters.hypotheses_a_round * self._draws.sides * models_share(len(models))
@@ -178,15 +181,35 @@ class Search:
         self._look_for(self.parameters.overlap_ratio)  # others are looked for as at first
 
     def round(self) -> Hypotheses:
-        """One round: draw pairs, look them up, test their hypotheses; the best of each pair and model, best first."""
-        if self.pool.refilled(self.rounds // ROUNDS_A_POOL):
-            self._draws = self._draws_of_pool()
-        if len(self.pool) < 2:
-            return no_hypotheses()
-        limits, share = self.parameters, 1.0 if self._until else self.served.share()
-        sought = self.served.wanted if self._until else self.served.searched()
+        """One round: draw pairs, look them up, test their hypotheses; the best of each pair and model, best first.
+
+        A long one has parts, each with a choice of its own to draw from.
+        """
+        share, sought = 1.0 if self._until else self.served.share(), self.served.wanted
+        if not self._until:
+            sought = self.served.searched()
+        parts = ceil(share / A_CHOICE)
+        found, right = [no_hypotheses()], np.zeros(len(self.models))
+        for _ in range(parts):
+            if self.pool.refilled(self.choices):
+                self._draws = self._draws_of_pool()
+            if len(self.pool) >= 2:
+                hypotheses, tested = self._drawn(share / parts, sought)
+                found.append(hypotheses)
+                right += tested
+            self.choices += 1
+        if len(found) > 1:
+            self.served.took(share, sought, right)
+        return joined(found).best_first()
+
+    def _drawn(self, share: float, sought: NDArray[np.bool_]) -> tuple[Hypotheses, Floats]:
+        """The hypotheses that pass of pairs of the present pool, and how many right pairs were tested of each model.
+
+        share : of a full round; sought : (models,) which are searched
+        """
+        limits = self.parameters
         count = round(share * limits.pairs_a_round / len(self.rungs))
-        drawn = self._draws.draw(count, self.seed, self.rounds, limits.max_tries)
+        drawn = self._draws.draw(count, self.seed, self.choices, limits.max_tries)
         # Three of four choices of sides are wrong: as many more hypotheses are tested for the same right pairs.
         most = share * limits.hypotheses_a_round * self._draws.sides * models_share(int(sought.sum()))
         tested = affordable(drawn, self.table.entries_of(sought), most, rarest_first=limits.telling_first)
@@ -202,9 +225,8 @@ class Search:
             self._allowed,
             sought,
         )
-        self.rounds += 1
-        self.served.took(share, sought, self._right_pairs(count, drawn.keys, tested.keys))
-        return trial.test(tested, self._draws.points, self.jobs)
+        right = self._right_pairs(count, drawn.keys, tested.keys)
+        return trial.test(tested, self._draws.points, self.jobs), right
 
     def _right_pairs(self, drawn_here: int, drawn: NDArray[np.int64], tested: NDArray[np.int64]) -> Floats:
         """How many right pairs a round tested of an instance of each model that shows `overlap_ratio`, (models,).
