@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from naive import self_overlap, shift_table
 from scanfind.kernels import overlap
-from scanfind.library.self_similar import highest_around
+from scanfind.library.self_similar import peaks_of
 from scanfind.pose import Pose, random_rotation
 
 Floats = NDArray[np.float64]
@@ -49,10 +49,13 @@ def test_shifts_equal_all_against_all_and_of_no_turn_lead_there_and_back(seed: i
         assert turn[0, 0] != 1.0 or (table == table[::-1, ::-1, ::-1]).all()
 
 
-@given(seed=st.integers(0, 2**32 - 1))
+@given(seed=st.integers(0, 2**32 - 1), least=st.floats(0.0, 1.0))
 @settings(max_examples=20, deadline=None)
-def test_the_highest_around_a_cell_is_that_of_27(seed: int) -> None:
+def test_a_peak_is_what_none_of_26_neighbours_exceeds(seed: int, least: float) -> None:
     rng = np.random.default_rng(seed)
-    table = rng.integers(0, 9, rng.integers(1, 7, 3))
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(table, 1), (3, 3, 3))
-    np.testing.assert_array_equal(highest_around(table), windows.max(axis=(3, 4, 5)))
+    table = np.pad(rng.integers(0, 9, rng.integers(1, 7, 3), np.int32), 1)
+    highest = np.lib.stride_tricks.sliding_window_view(np.pad(table, 1), (3, 3, 3)).max(axis=(3, 4, 5))
+    naive = np.argwhere((table == highest) & (table >= least * table.max()) & (table > 0))
+    found = peaks_of(table, least)
+    assert sorted(map(tuple, found)) == sorted(map(tuple, naive))
+    assert (np.diff(table[tuple(found.T)]) <= 0).all()

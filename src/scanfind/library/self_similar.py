@@ -27,12 +27,13 @@ SQUARE = np.cos(np.radians(4.0))  # faces turned less than this off the model's 
 # Motions that differ by less than this share of the diameter lead to one pose: ICP draws them together.
 ALIKE = 1.0 / 15.0
 # The table of shifts: samples paired, its cell in spacings of these, and most cells to either side of none.
-SHIFT_SAMPLES, SHIFT_CELL, SHIFT_CELLS = 1500, 2.0, 30
+SHIFT_SAMPLES, SHIFT_CELL, SHIFT_CELLS = 1500, 2.0, 50
 MOST_SHIFTS = 20
+PEAK = 0.05  # cells with less than this share of what the fullest holds are no peaks
 # After a turn: samples paired, shifts tried, and the least overlap (with less, each spool had five more, none of which
-# is a pose that anything was taken for). Most are hopeless, and a few samples show it.
-TURNED_SAMPLES, MOST_TURNED, LEAST_TURNED, TURNED_DIP = 400, 6, 0.5, 0.93
-FEW, FEW_SHARE = 40, 0.7
+# is a pose that anything was taken for); samples that show what is hopeless.
+TURNED_SAMPLES, MOST_TURNED, LEAST_TURNED, TURNED_DIP = 800, 6, 0.5, 0.93
+FEW = 60
 # A repetition: so many spacings to either side of it, the model lies on itself clearly less.
 SHIFT_FLANK, SHIFT_DIP = 4.0, 0.9
 
@@ -57,7 +58,7 @@ def find_similar(model: OntoItself, symmetry: Symmetry) -> tuple[Similar, ...]:
 
     drawn, motions = _drawn_along(model), list(_shifted(model))
     for axes in drawn:
-        motions += [*_turned(model, axes), *_turned_and_shifted(model, axes)]
+        motions += _turned_and_shifted(model, axes)
     motions += _turned(model, _principal(model))
     proposed = [Similar(model.overlap(motion), motion) for motion in motions]
     for rough in sorted(proposed, key=lambda each: -each.overlap):
@@ -113,7 +114,8 @@ def _shifted(model: OntoItself) -> Iterator[Pose]:
     """
     step = SHIFT_FLANK * model.spacing
     far = max(ALIKE * model.diameter, 2.0 * step)
-    for shift in _shifts(model, np.eye(3), np.eye(3), SHIFT_SAMPLES, far)[:MOST_SHIFTS]:
+    shifts = _shifts(model, np.eye(3), np.eye(3), SHIFT_SAMPLES)
+    for shift in shifts[np.linalg.norm(shifts, axis=1) > far][:MOST_SHIFTS]:
         here = model.overlap(shifted(shift))
         if here < LEAST_OVERLAP:
             continue
@@ -125,16 +127,19 @@ def _shifted(model: OntoItself) -> Iterator[Pose]:
 
 
 def _turned_and_shifted(model: OntoItself, axes: Floats) -> Iterator[Pose]:
-    """Turns of a cube along axes (3, 3), as rows, and shifts after which the model lies on itself clearly better than
-    a little aside: a header turned end for end has its branches elsewhere, and lies on itself where these do as well
-    as where its ends do.
+    """Turns of a cube along axes (3, 3), as rows, about the middle of the box, and with shifts after which the model
+    lies on itself clearly better than a little aside: a header turned end for end has its branches elsewhere, and lies
+    on itself where these do as well as where its ends do.
     """
     step = SHIFT_FLANK * model.spacing
-    for turn in cube_turns()[1:]:
-        rotation = axes.T @ turn @ axes
-        for shift in _shifts(model, axes, turn, TURNED_SAMPLES, 0.0)[:MOST_TURNED]:
+    for turned in _turned(model, axes):
+        yield turned
+        rotation = turned.rotation
+        for shift in _shifts(model, axes, axes @ rotation @ axes.T, TURNED_SAMPLES)[:MOST_TURNED]:
             motion = Pose(rotation, model.centre + shift - rotation @ model.centre)
-            if model.overlap(motion, FEW) < FEW_SHARE * LEAST_TURNED:
+            off = float(np.linalg.norm(motion.translation - turned.translation))
+            # Most are hopeless, which few samples show before it is fitted.
+            if off < 0.5 * ALIKE * model.diameter or model.overlap(motion, FEW) < 0.7 * LEAST_TURNED:
                 continue
             motion = model.settled(motion)
             if (here := model.overlap(motion)) < LEAST_TURNED:
@@ -144,11 +149,11 @@ def _turned_and_shifted(model: OntoItself, axes: Floats) -> Iterator[Pose]:
                 yield motion
 
 
-def _shifts(model: OntoItself, axes: Floats, turn: Floats, most: int, far: float) -> Floats:
+def _shifts(model: OntoItself, axes: Floats, turn: Floats, most: int) -> Floats:
     """The likeliest after a turn along axes (3, 3), about the model's middle, (K, 3), best first: peaks of how often
     each shift leads from a sample to one of like normal.
 
-    most : samples paired; far : shorter ones are none, metres
+    turn : along the axes; most : samples paired
     """
     from scanfind.kernels.overlap import count_shifts
 
@@ -158,24 +163,22 @@ def _shifts(model: OntoItself, axes: Floats, turn: Floats, most: int, far: float
     farthest = np.maximum(onto.max(axis=0) - points.min(axis=0), points.max(axis=0) - onto.min(axis=0))
     cell = max(SHIFT_CELL * model.spacing * np.sqrt(len(model.points) / count), farthest.max() / SHIFT_CELLS)
     reach = np.ceil(farthest / cell).astype(np.int64) + 1
-    table = np.zeros(2 * reach + 1, np.int64)
-    count_shifts(points, normals, onto, facing, model.signed, 1.0 / cell, reach, table)
-    peaks = np.argwhere((table == highest_around(table)) & (table > 0))
-    shifts = (peaks - reach) * cell
-    best = np.argsort(-table[tuple(peaks.T)], kind="stable")
-    return np.asarray(shifts[best[np.linalg.norm(shifts[best], axis=1) >= far]] @ axes)
+    table = np.zeros(2 * (reach + 1) + 1, np.int32)  # and a border, for peaks
+    count_shifts(points, normals, onto, facing, model.signed, 1.0 / cell, reach + 1, table)
+    return np.asarray((peaks_of(table, PEAK) - reach - 1) * cell @ axes)
 
 
-def highest_around(table: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The highest of each cell of a table (A, B, C) and its 26 neighbours."""
-    for axis in range(3):
-        one, two = [slice(None)] * 3, [slice(None)] * 3
-        one[axis], two[axis] = slice(1, None), slice(None, -1)
-        highest = table.copy()
-        np.maximum(highest[tuple(one)], table[tuple(two)], out=highest[tuple(one)])
-        np.maximum(highest[tuple(two)], table[tuple(one)], out=highest[tuple(two)])
-        table = highest
-    return table
+def peaks_of(table: NDArray[np.int32], least: float) -> NDArray[np.intp]:
+    """The cells (K, 3) of a table with an empty border that no neighbour exceeds, the fullest first; of those that hold
+    at least that share of what the fullest does.
+    """
+    at = np.argwhere(table >= max(least * table.max(), 1))
+    here = table[tuple(at.T)]
+    highest = here.copy()
+    for step in product((-1, 0, 1), repeat=3):
+        np.maximum(highest, table[tuple((at + step).T)], out=highest)
+    at, here = at[here == highest], here[here == highest]
+    return np.asarray(at[np.argsort(-here, kind="stable")])
 
 
 def shifted(shift: Floats) -> Pose:
