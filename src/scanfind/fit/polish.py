@@ -35,8 +35,8 @@ LEAST_NOISE = 1e-6  # of the diameter: exact points still have a rounding
 TUKEY = 4.685  # patches off by more sigmas count for nothing; 95 % as efficient as least squares on clean ones
 REWEIGHTINGS = 6
 LEAST_PATCHES = 12  # twice the unknowns
-# Raw points fix what surfels smooth away: a header's roll by 70 points on its branches, at 0.0007 to 0.003 of the mean. What the
-# facets of a pipe of 48 sides say of its roll, wrongly, is 0.0001.
+# Raw points fix what surfels smooth away: a header's roll by 70 points on its branches, at 0.0007 to 0.003 of the mean.
+# What the facets of a pipe of 48 sides say of its roll, wrongly, is 0.0001.
 OPEN_SHARE = 0.125
 # Further steps, as many times more, while they are as long as half a sigma: from surfels that roll came 2.5° off.
 MORE_STEPS, SHORT = 3, 0.5
