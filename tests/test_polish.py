@@ -22,7 +22,7 @@ from scanfind.kernels.distance import NearSurface
 from scanfind.library.near_surface import near_samples, near_triangles, signed_distances
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose, random_rotation
-from scanfind.simulate.parts import blocks, pipe
+from scanfind.simulate.parts import assemble, blocks, pipe
 from scanfind.simulate.placement import surface_points
 
 Floats = NDArray[np.float64]
@@ -34,6 +34,8 @@ BRACKET = blocks(
 )
 PLACE = Pose.from_rotation_vector([0.3, -0.5, 1.1], [0.4, -0.7, 1.3])
 NUDGE = Pose.from_rotation_vector([0.0004, 0.0003, -0.0005], [0.0004, -0.0003, 0.0002])
+# Off a pipe along z, at right angles to it.
+BRANCH = Pose.from_rotation_vector([0.0, np.pi / 2, 0.0], [0.08, 0.0, 0.7])
 TWICE = RefineParameters()
 
 
@@ -147,6 +149,21 @@ def test_a_straight_pipe_slides_and_rolls_and_is_sure_of_the_rest() -> None:
     assert np.abs(off.translation[:2]).max() < 0.0005
     # Along the axis the pose stays where it was.
     assert abs(off.translation[2] - NUDGE.translation[2]) < 2e-5
+
+
+def test_a_few_points_on_a_branch_hold_the_roll_of_a_long_header() -> None:
+    header = assemble("header", [(pipe(0.08, 2.2), Pose.identity()), (pipe(0.05, 0.3), BRANCH)])
+    points = seen(header, 9)
+    branch = np.linalg.norm(points[:, :2], axis=1) > 0.12
+    some = points[~branch | (np.cumsum(branch) % 2 == 0)]
+    assert 20 < np.count_nonzero(np.linalg.norm(some[:, :2], axis=1) > 0.12) < 0.05 * len(some)
+    rolled = PLACE @ Pose.from_rotation_vector([0.0, 0.0, np.radians(1.0)])
+    found = fitted(header, some, rolled)
+    off = np.degrees(PLACE.difference(found.scene_from_model)[1])
+    sigma = np.degrees(np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3]).max()))
+    assert off < max(3.0 * sigma, 0.05)
+    assert sigma < 0.3
+    assert all(motion.sigma is not None for motion in found.unobservable if motion.kind == "roll")
 
 
 def test_one_face_leaves_three_motions_open() -> None:

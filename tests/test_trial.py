@@ -14,7 +14,7 @@ from scanfind.library import JointTable, joint_table
 from scanfind.library.model import Model, build_model
 from scanfind.priors import Priors
 from scanfind.priors.allowed import allowed_poses
-from scanfind.search import served
+from scanfind.search import served, surface
 from scanfind.search.draws import Draws, Pairs, Trial, affordable, air_table, wald_table
 from scanfind.search.hypotheses import Hypotheses, model_arrays
 from scanfind.search.pool import Pool
@@ -112,3 +112,21 @@ def test_a_model_that_is_served_is_tested_no_more_and_lines_are_counted(monkeypa
     assert set(found.models.tolist()) == {1}
     assert search.served.right[1] > 0.0
     assert search.served.right[[0, 2]].tolist() == [0.0, 0.0]
+
+
+def test_a_long_round_draws_from_new_surfels_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn_from: list[NDArray[np.intp]] = []
+    fill = Pool.fill
+
+    def noted(self: Pool, number: int) -> None:
+        fill(self, number)
+        drawn_from.append(self.surfels)
+
+    monkeypatch.setattr(Pool, "fill", noted)
+    monkeypatch.setattr(served.Served, "share", lambda self: 2.5 * surface.A_CHOICE)
+    search = Search(scene(), models(), table(), model_arrays(models()), SearchParameters(), 0, 1)
+    found = search.round()
+    assert len(drawn_from) == 3  # the first was chosen when the search began
+    assert len({surfels.tobytes() for surfels in drawn_from}) == 3
+    assert search.served.effort == 2.5 * surface.A_CHOICE
+    assert (np.diff(found.support) <= 0.0).all()

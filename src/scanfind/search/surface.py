@@ -185,9 +185,8 @@ class Search:
 
         A long one has parts, each with a choice of its own to draw from.
         """
-        share, sought = 1.0 if self._until else self.served.share(), self.served.wanted
-        if not self._until:
-            sought = self.served.searched()
+        served = self.served
+        share, sought = (1.0, served.wanted) if self._until else (served.share(), served.searched())
         parts = ceil(share / A_CHOICE)
         found, right = [no_hypotheses()], np.zeros(len(self.models))
         for _ in range(parts):
@@ -199,7 +198,7 @@ class Search:
                 right += tested
             self.choices += 1
         if len(found) > 1:
-            self.served.took(share, sought, right)
+            served.took(share, sought, right)
         return joined(found).best_first()
 
     def _drawn(self, share: float, sought: NDArray[np.bool_]) -> tuple[Hypotheses, Floats]:
