@@ -84,7 +84,8 @@ def polish(
         # In the model's frame, about its centre: the true pose is pose @ motion.
         pose = pose @ Pose(turned, centre - turned @ centre + step[3:])
         variances, vectors = np.linalg.eigh(covariance)
-        long = (vectors.T @ step) ** 2 > SHORT**2 * np.maximum(variances, 0.0)
+        known = variances > 1e-9 * variances[-1]  # not along what is left open
+        long = (vectors[:, known].T @ step) ** 2 > SHORT**2 * variances[known]
         if number + 1 >= parameters.raw_steps and not long.any():
             break
     noise = 1.4826**2 * float(np.median(on.off**2))

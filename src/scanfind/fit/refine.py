@@ -31,7 +31,8 @@ class RefineParameters:
     coarse_samples, fine_samples : model samples used
     coarse_gates, fine_gates : first and last gate of each, in cells of that level; shrinking geometrically between
     normal_agreement : least cosine between a model's and a surfel's normal
-    raw_steps : last steps, on the isolated raw points themselves; 0: none, and no covariance (see `polish`)
+    raw_steps : last steps, on the isolated raw points themselves, more where these are long; 0: none, and no covariance
+        (see `polish`)
     unobservable_below : a motion is reported as not fixed by the data when its curvature is this share of the mean
     """
 

@@ -78,7 +78,7 @@ class Pool:
         self._stale = True
 
     def refilled(self, number: int) -> bool:
-        """Choose again where cells were withdrawn since the last time; number : see `fill`."""
+        """Choose again where cells were withdrawn since the last time, or for another number, see `fill`."""
         if stale := self._stale or number != self._number:
             self.fill(number)
         return stale
