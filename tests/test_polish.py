@@ -166,6 +166,11 @@ def test_a_few_points_on_a_branch_hold_the_roll_of_a_long_header() -> None:
     assert all(motion.sigma is not None for motion in found.unobservable if motion.kind == "roll")
 
 
+def test_the_facets_of_a_tank_do_not_hold_its_roll() -> None:
+    tank = pipe(0.3, 0.6)
+    assert "roll" in {motion.kind for motion in fitted(tank, seen(tank, 5)).unobservable if motion.sigma is None}
+
+
 def test_one_face_leaves_three_motions_open() -> None:
     points = seen(BRACKET, 6)
     face = points[(np.abs(points[:, 2]) < 0.008) & (points[:, :2] > 0.02).all(axis=1) & (points[:, 0] < 0.98)]

@@ -36,8 +36,9 @@ TUKEY = 4.685  # patches off by more sigmas count for nothing; 95 % as efficient
 REWEIGHTINGS = 6
 LEAST_PATCHES = 12  # twice the unknowns
 # Raw points fix what surfels smooth away: a header's roll by 70 points on its branches, at 0.0007 to 0.003 of the mean.
-# What the facets of a pipe of 48 sides say of its roll, wrongly, is 0.0001.
-OPEN_SHARE = 0.125
+# So much of what opens a motion among surfels does among raw points, of a roll that would take so many of them off the
+# surface: what facets say of a tank's roll, wrongly, is as much, and rolled by as far it is where it was.
+OPEN_SHARE, ROLLED, LEAVES = 0.125, 0.2, 0.01
 # Further steps, as many times more, while they are as long as half a sigma: from surfels that roll came 2.5° off.
 MORE_STEPS, SHORT = 3, 0.5
 
@@ -79,7 +80,10 @@ def polish(
         patches = patches_of(on, centre, radius, size / PATCHES_ACROSS, LEAST_NOISE * size)
         if len(patches.off) < LEAST_PATCHES:
             return None
-        step, covariance, free = solved(patches, OPEN_SHARE * parameters.unobservable_below)
+        below = parameters.unobservable_below
+        if rolls_off(near, patches, on.points, centre, radius, below, jobs):
+            below *= OPEN_SHARE
+        step, covariance, free = solved(patches, below)
         turned = rotation_from_vector(step[:3] / radius)
         # In the model's frame, about its centre: the true pose is pose @ motion.
         pose = pose @ Pose(turned, centre - turned @ centre + step[3:])
@@ -95,6 +99,21 @@ def polish(
         if variance > noise
     ]
     return Polished(pose, in_scene(covariance, pose.rotation, radius), pose.move(centre[None])[0], tuple(loose))
+
+
+def rolls_off(
+    near: NearSurface, patches: Patches, points: Floats, centre: Floats, radius: float, below: float, jobs: int
+) -> bool:
+    """Would the motion that patches fix least, where that is hardly at all, take points (K, 3) off their surface, were
+    it a roll by ROLLED radians? Model frame; below : see `solved`.
+    """
+    values, vectors = np.linalg.eigh((patches.rows / patches.variance[:, None]).T @ patches.rows)
+    roll = motion_of(vectors[:, 0], centre, radius)
+    if values[0] > below * values.mean() or roll.kind != "roll":
+        return False
+    through, turn = np.array(roll.through), rotation_from_vector(ROLLED * np.array(roll.axis))
+    distance, _ = measured(near, Pose(turn, through - turn @ through).inverse(), points, jobs)
+    return bool(np.isnan(distance).mean() > LEAVES)
 
 
 def polished(found: Detection, near: NearSurface, parameters: RefineParameters, jobs: int = 1) -> Detection:

@@ -43,7 +43,7 @@ NAMED = 5  # models in a note
 # A score that none of the poses a model could be taken for reaches: of 218 wrong poses in shops one was above 0.96, of
 # 128 right ones in shops sparse or with half of the object gone 60.
 SURE = 0.98
-# A score that no twin reaches in another's place: of 240 instances in plants six were so well explained by a twin that
+# A score that no twin reaches in another's place: of 240 instances in plants five were so well explained by a twin that
 # it would be believed, at up to 0.994.
 SURE_OF_NAME = 0.998
 
