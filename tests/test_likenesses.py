@@ -7,15 +7,16 @@ from functools import cache
 import numpy as np
 import pytest
 
+from scanfind.clock import Clock
+from scanfind.find import begin
 from scanfind.grid.moments import MomentGrid
-from scanfind.grid.scene import build_scene, first_cell
-from scanfind.library import joint_table
 from scanfind.library.model import Model, build_model
 from scanfind.mesh import Mesh
 from scanfind.parameters import PRESETS
 from scanfind.pose import Pose
 from scanfind.recognition.likenesses import Likenesses
 from scanfind.recognition.recognise import SURE, Recognition
+from scanfind.recognition.sizes import Sizes
 from scanfind.scans.sources import Sources
 from scanfind.simulate.parts import blocks
 from scanfind.simulate.scanner import scan
@@ -50,12 +51,13 @@ def search(built: str) -> Recognition:
     mesh = next(model.mesh for model in models() if model.name == built)
     assert mesh is not None
     scanned = scan(Scene((FLOOR, SceneObject(built, mesh, PLACE)), STATIONS), seed=3, points=150_000)
-    parameters, diameters = PRESETS["default"], [model.diameter for model in models()]
-    grid = MomentGrid(first_cell(diameters, parameters.grid))
+    parameters = PRESETS["default"]
+    sizes = Sizes(models(), parameters)
+    grid = MomentGrid(sizes.finest_cell())
     for chunk in Sources(scanned.stations).chunks():
         grid.add(chunk)
-    scene = build_scene(grid, min(diameters), parameters.grid, parameters.search.test_cells_across, 1)
-    return Recognition(scene, models(), joint_table(models()), parameters, 0, 1)
+    (size,) = sizes.groups()
+    return begin(size, grid, (), parameters, 0, 1, Clock())
 
 
 def test_only_what_is_of_like_size_is_a_likeness() -> None:

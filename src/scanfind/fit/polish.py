@@ -17,6 +17,7 @@ from scanfind.detection import Motion
 from scanfind.fit.patches import Patches, measured, patches_of, touching
 from scanfind.fit.refine import RefineParameters, in_scene, motion_of, triple
 from scanfind.isolation.deviation import deviation_of
+from scanfind.library.onto_itself import about
 from scanfind.pose import Pose, rotation_from_vector
 
 if TYPE_CHECKING:
@@ -80,10 +81,12 @@ def polish(
         patches = patches_of(on, centre, radius, size / PATCHES_ACROSS, LEAST_NOISE * size)
         if len(patches.off) < LEAST_PATCHES:
             return None
-        below = parameters.unobservable_below
-        if rolls_off(near, patches, on.points, centre, radius, below, jobs):
+        shares, motions = informed(patches)
+        below, least = parameters.unobservable_below, motion_of(motions[:, 0], centre, radius)
+        if shares[0] <= below and rolls_off(near, least, on.points, jobs):
             below *= OPEN_SHARE
-        step, covariance, free = solved(patches, below)
+        free = motions[:, shares <= below]
+        step, covariance = solved(patches, motions[:, shares > below])
         turned = rotation_from_vector(step[:3] / radius)
         # In the model's frame, about its centre: the true pose is pose @ motion.
         pose = pose @ Pose(turned, centre - turned @ centre + step[3:])
@@ -101,18 +104,12 @@ def polish(
     return Polished(pose, in_scene(covariance, pose.rotation, radius), pose.move(centre[None])[0], tuple(loose))
 
 
-def rolls_off(
-    near: NearSurface, patches: Patches, points: Floats, centre: Floats, radius: float, below: float, jobs: int
-) -> bool:
-    """Would the motion that patches fix least, where that is hardly at all, take points (K, 3) off their surface, were
-    it a roll by ROLLED radians? Model frame; below : see `solved`.
-    """
-    values, vectors = np.linalg.eigh((patches.rows / patches.variance[:, None]).T @ patches.rows)
-    roll = motion_of(vectors[:, 0], centre, radius)
-    if values[0] > below * values.mean() or roll.kind != "roll":
+def rolls_off(near: NearSurface, motion: Motion, points: Floats, jobs: int) -> bool:
+    """Would a motion take points (K, 3) off their surface, were it a roll by ROLLED radians? Model frame."""
+    if motion.kind != "roll":
         return False
-    through, turn = np.array(roll.through), rotation_from_vector(ROLLED * np.array(roll.axis))
-    distance, _ = measured(near, Pose(turn, through - turn @ through).inverse(), points, jobs)
+    back = about(np.array(motion.axis), np.array(motion.through), -ROLLED)
+    distance, _ = measured(near, back, points, jobs)
     return bool(np.isnan(distance).mean() > LEAVES)
 
 
@@ -136,16 +133,21 @@ def polished(found: Detection, near: NearSurface, parameters: RefineParameters, 
     )  # fmt: skip
 
 
-def solved(patches: Patches, below: float) -> tuple[Floats, Floats, Floats]:
-    """The step (6,) to where patches are matched best, its covariance (6, 6), and the motions left open, (6, F).
+def informed(patches: Patches) -> tuple[Floats, Floats]:
+    """What patches tell of each of as many motions as there are unknowns, least first: a share of the mean, (6,), and
+    the unit motions, (6, 6), as columns.
+    """
+    values, motions = np.linalg.eigh((patches.rows / patches.variance[:, None]).T @ patches.rows)
+    return values / values.mean(), motions
 
-    below : share of the mean information under which a motion is left open: no step along it, and no covariance
+
+def solved(patches: Patches, fixed: Floats) -> tuple[Floats, Floats]:
+    """The step (6,) to where patches are matched best, and its covariance (6, 6).
+
+    fixed : (6, K) unit motions that the patches fix: no step along others, and no covariance
 
     Tukey's weights over each patch's sigma: its noise, and what all patches disagree by beyond theirs.
     """
-    values, vectors = np.linalg.eigh((patches.rows / patches.variance[:, None]).T @ patches.rows)
-    free = values <= below * values.mean()
-    fixed = vectors[:, ~free]
     rows, weight, disagreement = patches.rows @ fixed, np.ones(len(patches.off)), 0.0
     for _ in range(REWEIGHTINGS):
         weighted = rows * (weight / (patches.variance + disagreement))[:, None]
@@ -161,7 +163,7 @@ def solved(patches: Patches, below: float) -> tuple[Floats, Floats, Floats]:
     slope = np.where(share < 1.0, (1.0 - share) * (1.0 - 5.0 * share), 0.0)
     spread = float(np.mean(weight**2 * share)) * TUKEY**2 / max(float(slope.mean()), 0.1) ** 2
     covariance = np.linalg.inv((rows * precision[:, None]).T @ rows) * max(spread, 1.0)
-    return fixed @ step, fixed @ covariance @ fixed.T, vectors[:, free]
+    return fixed @ step, fixed @ covariance @ fixed.T
 
 
 def disagreed(squares: Floats, variance: Floats, unknowns: int) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.fit.patches import patches_of, touching
-from scanfind.fit.polish import LEAST_NOISE, LEAST_PATCHES, MOST_POINTS, PATCHES_ACROSS, solved
+from scanfind.fit.polish import LEAST_NOISE, LEAST_PATCHES, MOST_POINTS, PATCHES_ACROSS, informed, solved
 from scanfind.pose import Pose, rotation_from_vector
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def similarity(
     near : the model's surface, metres, with a reach of the largest gate or more
     start : from where, as near as a gate; xyz : (N, 3) in the scan's own unit; scan_id : (N,) whose they are
     gates : of each step, metres: how far a point may be from the surface. There should be points as far as that
-    below : see `solved`
+    below : share of the mean information under which a motion is left open
     """
     some = slice(None, None, max(1, -(-len(xyz) // MOST_POINTS)))
     xyz, scan_id = np.ascontiguousarray(xyz[some]), scan_id[some]
@@ -60,9 +60,10 @@ def similarity(
         patches = patches_of(on, centre, radius, size / PATCHES_ACROSS, LEAST_NOISE * size, growing=True)
         if len(patches.off) < LEAST_PATCHES:
             return None
-        step, covariance, free = solved(patches, below)
-        if (np.abs(free[6]) > OPEN).any():
+        shares, motions = informed(patches)
+        if (np.abs(motions[6, shares <= below]) > OPEN).any():
             return None
+        step, covariance = solved(patches, motions[:, shares > below])
         at = grown(at, step, centre, radius, sqrt(covariance[6, 6]))
     return at
 

@@ -56,8 +56,8 @@ def find_similar(model: OntoItself, symmetry: Symmetry) -> tuple[Similar, ...]:
     def is_new(motion: Pose) -> bool:
         return all(_differ(model, motion, other.motion, symmetry) for other in kept)
 
-    drawn, motions = _drawn_along(model), list(_shifted(model))
-    for axes in drawn:
+    motions = list(_shifted(model))
+    for axes in _drawn_along(model):
         motions += _turned_and_shifted(model, axes)
     motions += _turned(model, _principal(model))
     proposed = [Similar(model.overlap(motion), motion) for motion in motions]
@@ -120,8 +120,7 @@ def _shifted(model: OntoItself) -> Iterator[Pose]:
         if here < LEAST_OVERLAP:
             continue
         ends = [model.overlap(shifted(shift + side * step * unit(shift))) for side in (-1, 1)]
-        aside = (model.overlap(shifted(shift + side * step * axis)) for axis in np.eye(3) for side in (-1, 1))
-        if max(ends) < SHIFT_DIP * here and all(each <= here for each in aside):
+        if max(ends) < SHIFT_DIP * here and all(each <= here for each in _aside(model, shifted(shift), np.eye(3))):
             yield shifted(shift)
             yield shifted(-shift)
 
@@ -131,7 +130,6 @@ def _turned_and_shifted(model: OntoItself, axes: Floats) -> Iterator[Pose]:
     lies on itself clearly better than a little aside: a header turned end for end has its branches elsewhere, and lies
     on itself where these do as well as where its ends do.
     """
-    step = SHIFT_FLANK * model.spacing
     for turned in _turned(model, axes):
         yield turned
         rotation = turned.rotation
@@ -144,9 +142,14 @@ def _turned_and_shifted(model: OntoItself, axes: Floats) -> Iterator[Pose]:
             motion = model.settled(motion)
             if (here := model.overlap(motion)) < LEAST_TURNED:
                 continue
-            aside = (model.overlap(shifted(side * step * axis) @ motion) for axis in axes for side in (-1, 1))
-            if all(each < TURNED_DIP * here for each in aside):
+            if all(each < TURNED_DIP * here for each in _aside(model, motion, axes)):
                 yield motion
+
+
+def _aside(model: OntoItself, motion: Pose, axes: Floats) -> Iterator[float]:
+    """How much of the model lies on itself a little to either side of a motion, along axes (3, 3), as rows."""
+    step = SHIFT_FLANK * model.spacing
+    return (model.overlap(shifted(side * step * axis) @ motion) for axis in axes for side in (-1, 1))
 
 
 def _shifts(model: OntoItself, axes: Floats, turn: Floats, most: int) -> Floats:

@@ -82,8 +82,7 @@ class LineSearch:
 
     def round(self) -> Hypotheses:
         """One round: draw pairs of lines, look them up, test their hypotheses; those that pass, best first."""
-        found = joined([no_hypotheses(), *(window.round() for window in self._windows)])
-        return found.take(np.argsort(-found.support, kind="stable"))
+        return joined([no_hypotheses(), *(window.round() for window in self._windows)]).best_first()
 
     def told(self, models: int) -> Floats:
         """How many hits a round counts for, of an instance of each of so many models, (models,): see TOLD_HITS."""
