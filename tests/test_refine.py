@@ -219,7 +219,7 @@ def scattered() -> Surfels:
 def test_marked_are_the_cells_of_a_cube_about_each_point(seed: int, reach: int, count: int) -> None:
     points = np.random.default_rng(seed).uniform(-1.3, 1.3, (count, 3))
     cells = scattered().cells
-    layers, marked = np.zeros((len(cells.block_rows), 8), np.uint64), np.zeros(len(scattered().sides), np.bool_)
+    layers, marked = np.zeros((len(cells.filled), 8), np.uint64), np.zeros(len(scattered().sides), np.bool_)
     mark_around(points, reach, cells.cell, cells.hash_keys, cells.hash_values, layers)
     mark_rows(cells.order, layers, cells.block_rows, marked)
     blocks = np.repeat(cells.order, np.diff(cells.first_cell))

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 import naive
 from scanfind.cloud import PointChunk, PointCloud
 from scanfind.grid.moments import MomentGrid, empty_hash
-from scanfind.grid.scene import GridParameters, Scene, build_scene
+from scanfind.grid.scene import GridParameters, Scene, build_scene, without_sparse_levels
 from scanfind.grid.surfels import Surfels
-from scanfind.kernels.blocks import BIAS, fill_hash, find_block, pack_block, unpack_block
+from scanfind.kernels.blocks import BIAS, fill_hash, find_block, pack_block, row_at, unpack_block
 from scanfind.kernels.surfels import smallest_eigenvector
 from scanfind.scans.sources import Sources
 
@@ -71,7 +71,7 @@ def assert_same_moments(one: MomentGrid, other: MomentGrid) -> None:
 def moments_of(grid: MomentGrid) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Address (block, cell, view) and moments of every row, by address."""
     blocks = grid.blocks()
-    cells = grid.block_rows[blocks]
+    cells = grid.block_rows.of(blocks)
     block, local = np.nonzero(cells >= 0)
     row, found = cells[block, local], []
     while len(row):  # along each cell's chain of views
@@ -108,6 +108,20 @@ def test_a_hash_finds_what_was_put_in_and_nothing_else(seed: int, count: int, re
     assert all(find_block(hash_keys, hash_values, key) == -1 for key in absent)
 
 
+def test_only_octants_with_a_point_have_room() -> None:
+    # Cells 0 and 63 of a block's eight octants are its corners and its middle.
+    corners = np.array([[x, y, z] for x in (0, 7) for y in (0, 7) for z in (0, 7)])
+    for some in ([0], [2, 5], list(range(8))):
+        grid = grid_of([chunk((corners[some] + 0.5) * CELL)])
+        (block,) = grid.blocks()
+        places = corners[some] @ [64, 8, 1]
+        rows = grid.block_rows.of(np.array([block]))[0]
+        np.testing.assert_array_equal(np.flatnonzero(rows >= 0), np.sort(places))
+        assert [row_at(grid.block_rows, block, place) for place in range(512)] == rows.tolist()
+        assert grid.moments[rows[places], 0].tolist() == [1] * len(some)
+        assert np.count_nonzero(grid.block_rows.octants[block] >= 0) == len(some)
+
+
 # ── sums ──
 
 
@@ -130,9 +144,11 @@ def test_arrays_grow_without_a_trace(monkeypatch: pytest.MonkeyPatch, jobs: int)
     points = np.random.default_rng(0).uniform(-12, 12, (100_000, 3))
     roomy = grid_of([chunk(points)], 0.1)
     monkeypatch.setattr("scanfind.grid.moments.EMPTY_BLOCKS", 1 << 10)
+    monkeypatch.setattr("scanfind.grid.moments.EMPTY_OCTANTS", 1 << 12)
     monkeypatch.setattr("scanfind.grid.moments.EMPTY_ROWS", 1 << 14)
     whole = grid_of([chunk(points)], 0.1, jobs=jobs)
     assert len(whole.block_keys) > 1 << 10
+    assert len(whole.block_rows.cells) > 1 << 12
     assert len(whole.moments) > 1 << 14
     assert_same_moments(whole, roomy)
     assert_same_moments(whole.coarser(), roomy.coarser())
@@ -389,6 +405,20 @@ def test_cells_grow_until_most_points_have_a_normal_and_no_further() -> None:
         assert scene.fine.cell >= 0.1 or share_with_normal(points, scene.fine.cell) >= share
         assert scene.fine.cell == 0.01 or share_with_normal(points, 0.5 * scene.fine.cell) < share
     assert resampled(points, 0.01, GridParameters(cell_m=0.01, normal_share=1.0)).fine.cell == 0.01
+
+
+@pytest.mark.parametrize("across", [10.0, 60.0])
+def test_no_scene_is_built_of_levels_that_are_too_sparse(across: float) -> None:
+    points, parameters = bumpy(4000), GridParameters(least_cells_across=across)
+    whole = grid_of([chunk(points)], 0.01)
+    rest = without_sparse_levels(whole, 2.0, parameters)
+    assert rest.cell > whole.cell
+    for diameter in (2.0, 5.0):  # the smallest model, and one searched for in cells of its own
+        mine, theirs = (build_scene(grid, diameter, parameters, 40.0, 1) for grid in (rest, whole))
+        assert_equal(mine.fine.fit(), theirs.fine.fit())
+        assert_equal(mine.around, theirs.around)
+    kept = GridParameters(cell_m=0.01, least_cells_across=across)
+    assert without_sparse_levels(whole, 2.0, kept) is whole
 
 
 def test_cells_grow_until_the_scan_fills_them() -> None:

@@ -10,7 +10,7 @@ from scanfind.detection import Findings
 from scanfind.errors import require
 from scanfind.fit.polish import polished
 from scanfind.grid.moments import MomentGrid
-from scanfind.grid.scene import build_scene
+from scanfind.grid.scene import build_scene, without_sparse_levels
 from scanfind.isolation.own import isolation_gate, with_own_points
 from scanfind.library import joint_table
 from scanfind.parameters import PRESETS, Parameters
@@ -104,6 +104,7 @@ def find(
         require_points(sources)
         grid.release()
         require_points_in(box, grid.points, grid.offset)
+        grid = without_sparse_levels(grid, found.smallest(), parameters.grid)
 
     asked = asked_of(library) if at_design else None
     for size in found.groups():  # large models first, each size at its own resolution

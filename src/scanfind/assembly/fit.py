@@ -177,7 +177,7 @@ class PartsFit:
         near = np.zeros(len(fine.sides), np.bool_)
         # Twice: a part may be off, and what hangs on it swings out farther.
         reach = min(MOST_REACH, int(np.ceil(2.0 * self.parameters.most_shift_m / at.cell)) + 1)
-        layers = np.zeros((len(at.block_rows), 8), np.uint64)
+        layers = np.zeros((len(at.filled), 8), np.uint64)
         mark_around(points, reach, at.cell, at.hash_keys, at.hash_values, layers)
         mark_rows(at.order, layers, at.block_rows, near)
         fine.fit(near[at.rows])

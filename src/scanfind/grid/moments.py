@@ -22,11 +22,11 @@ from scanfind.threads import side_by_side
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 # Of one shard, as the kernels of the pass take them: its hash table, the arrays all share, its counts.
-Arrays: TypeAlias = tuple[NDArray[Any], ...]
+Arrays: TypeAlias = tuple[Any, ...]
 
-# Room to begin with: 134 MB and 470 MB of addresses, of which only what is written becomes memory. From 2^14 and 2^20
-# on, doubling took 0.9 s of a pass over 10 M points that needs 0.8 s.
-EMPTY_BLOCKS, EMPTY_ROWS = 1 << 16, 1 << 22
+# Room to begin with: 2, 134 and 470 MB of addresses, of which only what is written becomes memory. From 2^14 blocks and
+# 2^20 rows on, doubling took 0.9 s of a pass over 10 M points that needs 0.8 s.
+EMPTY_BLOCKS, EMPTY_OCTANTS, EMPTY_ROWS = 1 << 16, 1 << 19, 1 << 22
 MOST_SHARDS = 8  # each reads all points, and a thread that adds a tenth of them gains nothing any more
 WORTH_A_THREAD = 1000  # points or blocks: fewer are added sooner than a thread is started
 POINTS_TO_SETTLE = 1000  # of which the median says where the scan lies
@@ -50,15 +50,17 @@ class MomentGrid:
     signed : every chunk said where its scanner stood
     units : offset units a cell
     block_keys : (blocks,) packed, -1 where none lies
-    block_rows : (blocks, 512) a row of each cell's moments, -1 for an empty cell
+    block_rows : a row of each cell's moments
     moments : (rows, 13) for each cell and view; links : (rows, 2) the row's view, and the cell's next row or -1
-    counts : (shards, 3) blocks and rows in use, and points left out; see kernels.grid.place_of for where they lie
+    counts : (shards, 4) blocks, octants and rows in use, and points left out; see kernels.grid.place_of for where they
+        lie
     """
 
     def __init__(
         self, cell: float, offset: Floats | None = None, jobs: int = 1, expected_rows: int = EMPTY_ROWS,
         box: Floats | None = None,
     ) -> None:  # fmt: skip
+        from scanfind.kernels.blocks import BlockRows
         from scanfind.kernels.grid import MOMENTS, OFFSET_UNITS
 
         self.cell = cell
@@ -68,12 +70,13 @@ class MomentGrid:
         self.signed = True
         self.units = OFFSET_UNITS
         self.block_keys = np.full(EMPTY_BLOCKS, -1, np.int64)
-        self.block_rows = room((EMPTY_BLOCKS, 512), np.dtype(np.int32))
+        int32 = np.dtype(np.int32)
+        self.block_rows = BlockRows(room((EMPTY_BLOCKS, 8), int32), room((EMPTY_OCTANTS, 64), int32))
         rows = max(EMPTY_ROWS, expected_rows)
         self.moments = room((rows, MOMENTS), np.dtype(np.int64))
-        self.links = room((rows, 2), np.dtype(np.int32))
+        self.links = room((rows, 2), int32)
         self._jobs, self._shards = jobs, min(jobs, MOST_SHARDS)
-        self.counts = np.zeros((self._shards, 3), np.int64)
+        self.counts = np.zeros((self._shards, 4), np.int64)
         self._tables = [empty_hash(EMPTY_BLOCKS // self._shards) for _ in range(self._shards)]
         self._held: list[PointChunk] = []
         self._beams: dict[tuple[float, ...], Ints] = {}
@@ -83,7 +86,9 @@ class MomentGrid:
     @property
     def unaddressable(self) -> int:
         """Points too far from the rest to be in a cell."""
-        return int(self.counts[0, 2])
+        from scanfind.kernels.grid import LEFT_OUT
+
+        return int(self.counts[0, LEFT_OUT])
 
     def add(self, chunk: PointChunk) -> None:
         """Sum a chunk's points into the grid and into the depth map of its scanner."""
@@ -128,7 +133,7 @@ class MomentGrid:
         blocks = self.blocks()
         for start in range(0, len(blocks), BLOCKS_AT_ONCE):
             some = blocks[start : start + BLOCKS_AT_ONCE]
-            first = self.block_rows[some].reshape(-1)
+            first = self.block_rows.of(some).reshape(-1)
             cells = np.flatnonzero(first >= 0)
             rows = first[cells]
             while len(rows):  # the first view of every cell, then the second of those that have one …
@@ -158,8 +163,10 @@ class MomentGrid:
 
     def memory_bytes(self) -> int:
         """What the rows and blocks in use take."""
-        blocks, rows, _ = self.counts.sum(axis=0)
-        return int(blocks * self.block_rows[0].nbytes + rows * (self.moments[0].nbytes + self.links[0].nbytes))
+        blocks, octants, rows, _ = self.counts.sum(axis=0)
+        of_a_block = self.block_keys[0].nbytes + self.block_rows.octants[0].nbytes
+        of_a_row = self.moments[0].nbytes + self.links[0].nbytes
+        return int(blocks * of_a_block + octants * self.block_rows.cells[0].nbytes + rows * of_a_row)
 
     def _in_shards(self, count: int, work: Callable[[int, int, Arrays], int]) -> None:
         """Call work(at, shard, the shard's arrays) until each shard is at `count`, with more room where it stopped."""
@@ -218,18 +225,21 @@ class MomentGrid:
     def _make_room(self) -> None:
         """Double whichever array some shard has filled."""
         from scanfind.kernels.blocks import fill_hash
-        from scanfind.kernels.grid import BLOCKS_A_LOT, ROWS_A_LOT, ROWS_OF_OCTANT, room_for
+        from scanfind.kernels.grid import BATCH, BLOCKS, LOTS, OCTANTS, ROWS, ROWS_OF_OCTANT, is_full
 
-        blocks, rows, _ = self.counts.max(axis=0)
-        if blocks + 1 > room_for(len(self.block_keys), BLOCKS_A_LOT, self._shards):
-            self.block_rows = doubled(self.block_rows)
+        most, shards = self.counts.max(axis=0), self._shards
+        octants, cells = self.block_rows
+        if is_full(most, OCTANTS, BATCH, len(cells), shards):
+            self.block_rows = self.block_rows._replace(cells=doubled(cells))
+        if is_full(most, BLOCKS, BATCH, len(self.block_keys), shards):
+            self.block_rows = self.block_rows._replace(octants=doubled(octants))
             self.block_keys = np.concatenate([self.block_keys, np.full(len(self.block_keys), -1)])
             used = np.flatnonzero(self.block_keys >= 0)
-            for shard in range(self._shards):
-                self._tables[shard] = empty_hash(len(self.block_keys) // self._shards)
-                theirs = used[used // BLOCKS_A_LOT % self._shards == shard]
+            for shard in range(shards):
+                self._tables[shard] = empty_hash(len(self.block_keys) // shards)
+                theirs = used[used // LOTS[BLOCKS] % shards == shard]
                 fill_hash(self.block_keys, theirs, *self._tables[shard])
-        if rows + ROWS_OF_OCTANT > room_for(len(self.moments), ROWS_A_LOT, self._shards):
+        if is_full(most, ROWS, ROWS_OF_OCTANT, len(self.moments), shards):
             self.moments, self.links = doubled(self.moments), doubled(self.links)
 
     def blocks(self) -> NDArray[np.intp]:
@@ -240,16 +250,18 @@ class MomentGrid:
 
     def rows_end(self) -> int:
         """All rows in use lie before this one."""
-        from scanfind.kernels.grid import ROWS_A_LOT
+        from scanfind.kernels.grid import LOTS, ROWS
 
         self.release()
-        lots = -(-int(self.counts[:, 1].max()) // ROWS_A_LOT)
-        return lots * self._shards * ROWS_A_LOT
+        lots = -(-int(self.counts[:, ROWS].max()) // LOTS[ROWS])
+        return lots * self._shards * LOTS[ROWS]
 
     def points_per_row(self) -> float:
         """Raw points a cell, on average, counting a cell once for each view."""
+        from scanfind.kernels.grid import ROWS
+
         self.release()
-        return self.points / max(int(self.counts[:, 1].sum()), 1)
+        return self.points / max(int(self.counts[:, ROWS].sum()), 1)
 
     def coarser(self) -> MomentGrid:
         """The next level of the octree: cells of twice the edge, each the sum of its eight children; summed once."""
@@ -259,11 +271,11 @@ class MomentGrid:
         return self._coarser
 
     def _summed(self) -> MomentGrid:
-        from scanfind.kernels.grid import sum_children
+        from scanfind.kernels.grid import LEFT_OUT, sum_children
 
         parent = MomentGrid(2.0 * self.cell, self.offset, self._jobs)
         parent.points, parent.signed = self.points, self.signed
-        parent.counts[0, 2] = self.counts[0, 2]
+        parent.counts[0, LEFT_OUT] = self.unaddressable
         parent.units = 2.0 * self.units
         parent._beams = self._beams
         blocks, half = self.blocks(), np.int64(self.units / 2)

@@ -127,11 +127,10 @@ def build_scene(
     test_cells_across : cells of the sequential test along that diameter; a surfel tolerates a sample that is half of
         one off along its normal
     """
-    largest_cell = diameter / parameters.least_cells_across
     while 2.0 * grid.cell <= first_cell([diameter], parameters) * (1.0 + 1e-9):
         grid = grid.coarser()
     fine = Surfels(grid, parameters.min_neighbours, jobs)
-    while parameters.cell_m is None and 2.0 * grid.cell <= largest_cell and not filled(grid, fine, parameters):
+    while can_double(grid, diameter, parameters) and not filled(grid, fine, parameters):
         grid = grid.coarser()
         fine = Surfels(grid, parameters.min_neighbours, jobs)
     half = grid.coarser()
@@ -145,6 +144,22 @@ def build_scene(
     return Scene(
         fine, coarse, around, tolerant, beams, depths, noise_of(fine, some(fine)), grid.points, grid.unaddressable
     )
+
+
+def without_sparse_levels(grid: MomentGrid, diameter: float, parameters: GridParameters) -> MomentGrid:
+    """A filled grid without the levels that the scan is too sparse for, whatever is built of them: of points farther
+    apart than the finest cells these took a quarter of all memory.
+
+    diameter : of the smallest model sought, metres: for larger ones cells are doubled as long, and longer
+    """
+    while can_double(grid, diameter, parameters) and grid.points_per_row() < parameters.points_per_cell:
+        grid = grid.coarser()
+    return grid
+
+
+def can_double(grid: MomentGrid, diameter: float, parameters: GridParameters) -> bool:
+    """May cells be doubled, and still be small enough for a model?"""
+    return parameters.cell_m is None and 2.0 * grid.cell <= diameter / parameters.least_cells_across
 
 
 def some(surfels: Surfels) -> NDArray[np.intp]:

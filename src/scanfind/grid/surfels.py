@@ -6,7 +6,7 @@ fitting all of them took a third of a whole search (decisions/0009-fitted-on-dem
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 from scanfind.cloud import OrientedCloud
 from scanfind.grid.moments import MomentGrid, empty_hash
 from scanfind.threads import in_threads
+
+if TYPE_CHECKING:
+    from scanfind.kernels.blocks import BlockRows
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -26,7 +29,7 @@ class Cells(NamedTuple):
     cell : edge, metres
     offset : (3,) the grid's origin in the scan's frame; everything else is relative to it
     hash_keys, hash_values : packed block coordinates → block
-    block_keys : packed; block_rows : (…, 512) int32, the row of each cell, -1 for an empty one
+    block_keys : packed; block_rows : the row of each cell
     filled : (…, 8) uint64, a bit for each cell that is not empty, eight words of eight by eight
     order : (B,) where the blocks lie in these, by key; first_cell : (B+1,) where the cells of each begin
     locals : (V,) int16, each cell's place in its block; rows : (V,) int32, its row
@@ -37,7 +40,7 @@ class Cells(NamedTuple):
     hash_keys: Ints
     hash_values: NDArray[np.int32]
     block_keys: Ints
-    block_rows: NDArray[np.int32]
+    block_rows: BlockRows
     filled: NDArray[np.uint64]
     order: NDArray[np.intp]
     first_cell: Ints
@@ -155,7 +158,7 @@ def number(grid: MomentGrid, jobs: int) -> Cells:
     in_threads(jobs, len(order), lambda start, stop: count_cells(start, stop, order, block_rows, counts))
     first_cell = np.concatenate([[0], np.cumsum(counts)])
     places, rows = np.empty(first_cell[-1], np.int16), np.empty(first_cell[-1], np.int32)
-    filled = np.zeros((len(block_rows), 8), np.uint64)
+    filled = np.zeros((len(block_keys), 8), np.uint64)
     in_threads(
         jobs, len(order),
         lambda start, stop: number_cells(start, stop, order, block_rows, first_cell, places, rows, filled),

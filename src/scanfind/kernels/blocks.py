@@ -68,6 +68,42 @@ def fill_hash(block_keys, blocks, keys, values):
         insert_block(keys, values, block_keys[block], block)
 
 
+class BlockRows(NamedTuple):
+    """The row of each cell of each block. A block is eight octants of 4×4×4 cells, and only what has a point has room:
+    where points lie farther apart than blocks are wide, one for each cell of a block was 2 kB a point.
+
+    octants : (B, 8) int32, where the cells of each octant are, -1 where it has none
+    cells : (O, 64) int32, the row of each, -1 for an empty one
+    """
+
+    octants: NDArray[np.int32]
+    cells: NDArray[np.int32]
+
+    def of(self, blocks: NDArray[np.integer]) -> NDArray[np.int32]:
+        """The rows of all cells of some blocks, (K, 512), by their place in the block; -1 for an empty one."""
+        octants = self.octants[blocks]
+        rows = np.where(octants[..., None] < 0, np.int32(-1), self.cells[octants])
+        # Which half and which quarter along each axis, one beside the other, are the place along it.
+        return rows.reshape(-1, 2, 2, 2, 4, 4, 4).transpose(0, 1, 4, 2, 5, 3, 6).reshape(-1, 512)
+
+
+@kernel
+def octant_of(local):
+    """Which of its block's octants a cell lies in, and where in that."""
+    octant = ((local >> 6) & 4) | ((local >> 4) & 2) | ((local >> 2) & 1)
+    return octant, ((local >> 2) & 0x30) | ((local >> 1) & 0xC) | (local & 3)
+
+
+@kernel
+def row_at(rows, block, local):
+    """The row of a cell of a block, -1 where it is empty; rows : BlockRows."""
+    octant, place = octant_of(local)
+    where = rows.octants[block, octant]
+    if where < 0:
+        return np.int64(-1)
+    return np.int64(rows.cells[where, place])
+
+
 class BlockTable(NamedTuple):
     """Where the blocks of a sparse grid are: in a dense table of the box they lie in, for one that is looked up a lot.
 

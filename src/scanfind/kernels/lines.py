@@ -6,7 +6,7 @@ from math import ceil
 
 import numpy as np
 
-from scanfind.kernels.blocks import find_block, pack_block, unpack_block
+from scanfind.kernels.blocks import find_block, pack_block, row_at, unpack_block
 from scanfind.kernels.jit import kernel
 from scanfind.kernels.search import lie_on_scene
 from scanfind.kernels.surfels import add_moved, smallest_eigenvector, sum_views
@@ -62,7 +62,7 @@ def fit_lines(
                         other = around[((ix >> 3) + 1) * 9 + ((iy >> 3) + 1) * 3 + (iz >> 3) + 1]
                         if other < 0:
                             continue
-                        row = np.int64(block_rows[other, ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7)])
+                        row = row_at(block_rows, other, ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7))
                         if row < 0:
                             continue
                         for k in range(10):

@@ -6,7 +6,7 @@ from math import floor
 
 import numpy as np
 
-from scanfind.kernels.blocks import find_block, pack_block
+from scanfind.kernels.blocks import find_block, pack_block, row_at
 from scanfind.kernels.jit import kernel
 
 # A sequence in which each six bits come once (Leiserson, Prokop & Randall 1998), and where they come.
@@ -44,7 +44,7 @@ def nearest_surfel(
                     there = filled[block, lx] & word
                     while there != 0:
                         others = there & (there - np.uint64(1))
-                        row = block_rows[block, (lx << 6) | place_of(there ^ others)]
+                        row = row_at(block_rows, block, (lx << 6) | place_of(there ^ others))
                         there = others
                         for s in range(first_surfel[row], first_surfel[row] + sides[row]):
                             dx, dy, dz = means[s, 0] - x, means[s, 1] - y, means[s, 2] - z
@@ -112,6 +112,6 @@ def mark_rows(blocks, layers, block_rows, marked):
                 continue
             for place in range(64):
                 if (word >> np.uint64(place)) & np.uint64(1):
-                    row = block_rows[block, (lx << 6) | place]
+                    row = row_at(block_rows, block, (lx << 6) | place)
                     if row >= 0:
                         marked[row] = True

@@ -6,7 +6,7 @@ from math import ceil, floor, sqrt
 
 import numpy as np
 
-from scanfind.kernels.blocks import find_block, pack_block, unpack_block
+from scanfind.kernels.blocks import find_block, pack_block, row_at, unpack_block
 from scanfind.kernels.jit import kernel
 from scanfind.kernels.surfels import smallest_eigenvector
 
@@ -101,7 +101,7 @@ def bulge_of_surfels(
                         block = find_block(hash_keys, hash_values, pack_block(ix >> 3, iy >> 3, held))
                     if block < 0:
                         continue
-                    row = block_rows[block, ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7)]
+                    row = row_at(block_rows, block, ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7))
                     if row < 0:
                         continue
                     for j in range(first_surfel[row], first_surfel[row] + sides[row]):
@@ -131,4 +131,4 @@ def spread_down(levels, block_keys, order, first_cell, cell_locals, hash_keys, h
             x = (((bx << 3) | (local >> 6)) >> levels) & 7
             y = (((by << 3) | ((local >> 3) & 7)) >> levels) & 7
             z = (((bz << 3) | (local & 7)) >> levels) & 7
-            found[c] = above[block_rows[higher, (x << 6) | (y << 3) | z]]
+            found[c] = above[row_at(block_rows, higher, (x << 6) | (y << 3) | z)]

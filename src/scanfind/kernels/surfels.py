@@ -6,7 +6,7 @@ from math import acos, cos, pi, sqrt
 
 import numpy as np
 
-from scanfind.kernels.blocks import find_block, pack_block, unpack_block
+from scanfind.kernels.blocks import find_block, octant_of, pack_block, row_at, unpack_block
 from scanfind.kernels.jit import kernel
 
 
@@ -48,12 +48,12 @@ def smallest_eigenvector(a00, a01, a02, a11, a12, a22):
 
 @kernel
 def count_cells(start, stop, order, block_rows, counts):
-    """Occupied cells of blocks order[start:stop], into counts (B,); block_rows : (B, 512), -1 for an empty cell."""
+    """Occupied cells of blocks order[start:stop], into counts (B,)."""
     for block in range(start, stop):
         counts[block] = 0
-        for local in range(512):
-            if block_rows[order[block], local] >= 0:
-                counts[block] += 1
+        for octant in block_rows.octants[order[block]]:
+            if octant >= 0:
+                counts[block] += (block_rows.cells[octant] >= 0).sum()
 
 
 @kernel
@@ -63,12 +63,18 @@ def number_cells(start, stop, order, block_rows, first_cell, cell_locals, cell_r
     """
     for block in range(start, stop):
         cell = first_cell[block]
-        for local in range(512):
-            row = block_rows[order[block], local]
-            if row >= 0:
-                cell_locals[cell], cell_rows[cell] = local, row
-                filled[order[block], local >> 6] |= np.uint64(1) << np.uint64(local & 63)
-                cell += 1
+        for start_of_run in range(0, 512, 4):
+            octant, place = octant_of(start_of_run)
+            where = block_rows.octants[order[block], octant]
+            if where < 0:
+                continue
+            for k in range(4):
+                row = block_rows.cells[where, place + k]
+                if row >= 0:
+                    local = start_of_run + k
+                    cell_locals[cell], cell_rows[cell] = local, row
+                    filled[order[block], local >> 6] |= np.uint64(1) << np.uint64(local & 63)
+                    cell += 1
 
 
 @kernel
@@ -156,7 +162,7 @@ def fit_cells(
             neighbours[k] = -1
             if other < 0:
                 continue
-            row = np.int64(block_rows[other, ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7)])
+            row = row_at(block_rows, other, ((ix & 7) << 6) | ((iy & 7) << 3) | (iz & 7))
             if row < 0:
                 continue
             neighbours[k] = row

@@ -104,7 +104,7 @@ class Ground:
         from scanfind.kernels.nearest import mark_around, mark_rows
 
         at = self.scene.fine.cells
-        layers = np.zeros((len(at.block_rows), 8), np.uint64)
+        layers = np.zeros((len(at.filled), 8), np.uint64)
         mark_around(points, reach, at.cell, at.hash_keys, at.hash_values, layers)
         mark_rows(at.order, layers, at.block_rows, marked)
 

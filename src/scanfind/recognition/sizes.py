@@ -77,6 +77,10 @@ class Sizes:
         needed = [min(diameters) / CELLS_ACROSS_SMALLER for diameters in smaller]
         return min([first_cell(largest, self._parameters.grid), *needed])
 
+    def smallest(self) -> float:
+        """The diameter of the smallest model, metres."""
+        return min(model.diameter for model in self._models)
+
     def groups(self) -> list[Size]:
         """The models in groups, in the order in which to search for them."""
         groups = by_size(self._models)

@@ -15,7 +15,7 @@ from scanfind.design.elements import placements_of
 from scanfind.detection import Detection, Refused
 from scanfind.find import begin, recognise
 from scanfind.grid.moments import MomentGrid
-from scanfind.grid.scene import first_cell
+from scanfind.grid.scene import first_cell, without_sparse_levels
 from scanfind.pose import Pose
 from scanfind.priors.allowed import middle_of
 from scanfind.recognition.candidate import Standing
@@ -84,7 +84,8 @@ def search(
     # How many there are of the whole site says nothing of a tile.
     limits, priors = job.parameters.search, replace(job.parameters.priors, expect=None)
     own = replace(job.parameters, search=replace(limits, max_instances=None, deeper=deeper), priors=priors)
-    grid = grid_of(job, models, tile, signed, scans)
+    size, found = Size(models, 0, 1), Sizes(models, own)
+    grid = without_sparse_levels(grid_of(job, models, tile, signed, scans), found.smallest(), own.grid)
     taken = [
         Standing(surface_of(job.folder, one.model, reach), one.scene_from_model)
         for one in standing
@@ -93,7 +94,6 @@ def search(
     if owned is not None and not grid.points:  # of what the design has where no scan was made beams tell
         owned = owned._replace(places={})
     asked = None if owned is None else owned.asked(job, models)
-    size, found = Size(models, 0, 1), Sizes(models, own)
     if owned is not None and owned.only:
         search = begin(size, grid, taken, own, job.seed, job.jobs, Clock(), asked, learnt)
     else:
