@@ -16,7 +16,7 @@ from scanfind.library.model import Model, ModelParameters, build_model
 from scanfind.library.surface import SurfaceParameters
 from scanfind.pose import Pose
 from scanfind.recognition.stands import as_designed
-from scanfind.recognition.swaps import are_alike, onto, pairs_alike
+from scanfind.recognition.swaps import onto, pairs_alike, sides_of
 from scanfind.recognition.witnesses import known_along
 from scanfind.simulate.parts import blocks, box
 from seen import seen_of
@@ -92,8 +92,8 @@ def test_what_the_design_has_in_front_hides_and_is_not_beside() -> None:
 
 def test_alike_are_those_of_one_section_whose_lengths_can_be_told_apart() -> None:
     models = [bar(2.0), bar(2.1), bar(2.0, 0.21), bar(2.0, 0.3), bar(3.0)]
-    assert not are_alike(models[0], models[2])  # of one length
-    assert pairs_alike(models) == {(0, 1), (1, 2)}
+    sides = np.array([sides_of(model) for model in models])
+    assert pairs_alike(sides) == {(0, 1), (1, 2)}  # the first and the third are of one length
 
 
 def test_a_model_is_put_onto_another_side_along_side_and_middle_to_middle() -> None:

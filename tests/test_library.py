@@ -175,6 +175,25 @@ def test_what_is_there_already_costs_no_work(filled: Path, monkeypatch: pytest.M
         assert library.names() == ["crate", "tube"]
 
 
+def test_several_prepared_side_by_side_are_as_added_one_by_one(filled: Path, path: Path) -> None:
+    more = [
+        replace(tube(0.3, 1.0), name="new"),
+        box(1, 2, 3, name="crate"),  # there already
+        placed(replace(tube(0.1, 2.0), name="thin"), PLACED),
+        placed(replace(tube(0.1, 2.0), name="thin again"), replace(PLACED, global_id="other")),
+    ]
+    with ModelLibrary.open(filled) as one, ModelLibrary.open(path.with_suffix(".2"), create=True) as other:
+        for model in one.models():
+            other.put(model)
+        added = [one.add(model, SMALL) for model in more]
+        for mine, theirs in zip(added, other.add_all(more, SMALL, jobs=2), strict=True):
+            assert_same(theirs, mine)
+        assert_same(tuple(other.models()), tuple(one.models()))
+        with pytest.raises(LibraryError, match="'crate' is there already"):
+            list(other.add_all([replace(tube(0.7, 1.0), name="wide"), box(1, 1, 1, name="crate")], SMALL, jobs=2))
+        assert other.names() == one.names()
+
+
 def test_new_placements_join_those_known(filled: Path) -> None:
     moved, other = replace(PLACED, design_from_model=Pose.identity()), replace(PLACED, global_id="other")
     with ModelLibrary.open(filled) as library:

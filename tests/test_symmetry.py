@@ -314,6 +314,18 @@ def test_the_frame_could_be_taken_for_itself_turned_over_and_each_way_once(pose:
     assert [each.overlap for each in found] == sorted((each.overlap for each in found), reverse=True)
 
 
+def test_turns_that_cannot_fit_are_left_out_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is found is found without that, too."""
+    branches = [((0.5, 0, 0.2), (0.7, 0.2, 0.7)), ((2.2, 0, 0.2), (2.4, 0.2, 0.5))]
+    run = blocks("run", [((0, 0, 0), (3, 0.2, 0.2)), *branches])
+    for mesh in (run, moved(run, SOMEWHERE), box(1.0, 0.7, 0.4), BRACKET, tee(0.1, 0.1, 0.6, 0.3)):
+        with_it = similar_to(itself(mesh))
+        with monkeypatch.context() as patched:
+            patched.setattr("scanfind.library.self_similar._fits", lambda *_: True)
+            without = similar_to(itself(mesh))
+        assert [each.overlap for each in with_it] == [each.overlap for each in without]
+
+
 def test_a_symmetry_is_no_alternative() -> None:
     for mesh in (box(0.5, 0.5, 0.5), cylinder(0.1, 1.2), ball()):
         assert similar_to(itself(mesh)) == ()

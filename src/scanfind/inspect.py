@@ -82,7 +82,7 @@ def inspect(
     """
     parameters = parameters or PRESETS["default"]
     profile = None if allowed is None else profile_allowing(allowed)
-    models, priors = models_of(design, parameters, units, select), parameters.priors
+    models, priors = models_of(design, parameters, units, select, jobs, progress), parameters.priors
     if priors.scale_free:
         msg = "inspect: how far off things are needs scans in metres: find the scale with `scanfind find --scale-free`"
         raise UsageError(msg)
@@ -93,11 +93,10 @@ def inspect(
         models, align = in_region(models, priors), "never"
 
     def found(placed: Sequence[Model], *, at_design: bool = True, isolate: bool = True) -> Findings:
-        with library_of(placed) as library:
-            return search(
-                scans, library, parameters=parameters, seed=seed, jobs=jobs, origin=origin, progress=progress,
-                isolate=isolate, at_design=at_design,
-            )  # fmt: skip
+        return search(
+            scans, placed, parameters=parameters, seed=seed, jobs=jobs, origin=origin, progress=progress,
+            isolate=isolate, at_design=at_design,
+        )  # fmt: skip
 
     findings = found(models, at_design=align != "always", isolate=align != "always")
     in_place = any(element.status == INSTALLED for element in findings.elements)

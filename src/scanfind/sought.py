@@ -10,37 +10,47 @@ from typing import TYPE_CHECKING, TypeAlias
 from scanfind.cloud import CloudModel
 from scanfind.errors import UsageError
 from scanfind.library import ModelLibrary
-from scanfind.library.model import ModelParameters
+from scanfind.library.model import Model, ModelParameters
 from scanfind.mesh import Mesh
+from scanfind.threads import available_cores
 
 if TYPE_CHECKING:
-    from scanfind.library.model import Model
     from scanfind.parameters import Parameters
+    from scanfind.progress import Progress
 
-ModelInput: TypeAlias = "ModelLibrary | Mesh | CloudModel | str | PathLike[str]"
+ModelInput: TypeAlias = "ModelLibrary | Model | Mesh | CloudModel | str | PathLike[str]"
 
 
 def models_of(
-    models: ModelInput | Sequence[ModelInput], parameters: Parameters, units: str | None, select: Sequence[str]
-) -> list[Model]:
-    """The models sought, prepared: from a library as they are there, from files and meshes with these parameters."""
-    listed = [models] if isinstance(models, (ModelLibrary, Mesh, CloudModel, str, PathLike)) else list(models)
+    models: ModelInput | Sequence[ModelInput], parameters: Parameters, units: str | None, select: Sequence[str],
+    jobs: int | None = None, tell: Progress | None = None,
+) -> list[Model]:  # fmt: skip
+    """The models sought, prepared: from a library as they are there, from files and meshes with these parameters.
+
+    jobs : prepared at a time; None: one a core; tell : called with ("library", prepared so far, all of them)
+    """
+    listed = [models] if isinstance(models, (ModelLibrary, Model, Mesh, CloudModel, str, PathLike)) else list(models)
     prepare = ModelParameters(parameters.surface, parameters.pairs)
     sought: list[Model] = []
+    unprepared: list[Mesh | CloudModel] = []
     with ModelLibrary.in_memory() as fresh:
         for given in listed:
             if isinstance(given, ModelLibrary):
                 sought.extend(given.models())
+            elif isinstance(given, Model):
+                sought.append(given)
             elif isinstance(given, (Mesh, CloudModel)):
-                fresh.add(given, prepare)
+                unprepared.append(given)
             elif is_library(given):
                 with ModelLibrary.open(Path(given)) as library:
                     sought.extend(library.models())
             else:
                 from scanfind.models import read_models
 
-                for model in read_models(Path(given), units=units, select=select):
-                    fresh.add(model, prepare)
+                unprepared += read_models(Path(given), units=units, select=select)
+        for done, _ in enumerate(fresh.add_all(unprepared, prepare, jobs or available_cores()), start=1):
+            if tell:
+                tell("library", done, len(unprepared))
         sought.extend(fresh.models())
     names = [model.name for model in sought]
     if twice := sorted({name for name in names if names.count(name) > 1}):

@@ -11,8 +11,10 @@ from scanfind.cli.options import note
 from scanfind.errors import UsageError
 
 if TYPE_CHECKING:
+    from scanfind.cloud import CloudModel
     from scanfind.config import Run
     from scanfind.library import ModelLibrary
+    from scanfind.mesh import Mesh
     from scanfind.parameters import Parameters
 
 
@@ -51,14 +53,21 @@ def add_models(
     from scanfind.library.model import ModelParameters
     from scanfind.mesh import Mesh
     from scanfind.models import STATES_UNITS, read_models
+    from scanfind.progress import progress_on
+    from scanfind.threads import available_cores
 
     prepared = ModelParameters(surface=parameters.surface, pairs=parameters.pairs, symmetry=symmetry)
-    names = []
+    read: list[Mesh | CloudModel] = []
     for file in files:
         # One --units may stand for a mixed list of files, of which some say theirs.
         units = None if file.suffix.lower() in STATES_UNITS else run.units
         for model in read_models(file, units=units, select=run.select):
             if isinstance(model, Mesh) and "hint" in model.notes:
                 note(f"{model.name}: {model.notes['hint']}")
-            names.append(models.add(model, prepared).name)
+            read.append(model)
+    names = []
+    with progress_on() as tell:
+        for added in models.add_all(read, prepared, run.jobs or available_cores()):
+            names.append(added.name)
+            tell("library", len(names), len(read))
     return names

@@ -5,7 +5,8 @@ Models accumulate in one SQLite file. A model already there, by a hash of its ge
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import TracebackType
@@ -66,6 +67,27 @@ class ModelLibrary:
             return self._join_placements(sha256, model.placements if isinstance(model, Mesh) else ())
         # Outside any transaction, because it takes seconds: others go on meanwhile, and may add the same model.
         return self.put(build_model(model, parameters))
+
+    def add_all(
+        self, models: Iterable[Mesh | CloudModel], parameters: ModelParameters = DEFAULTS, jobs: int = 1
+    ) -> Iterator[Model]:
+        """Add models one after the other, as `add` does, but prepare so many of them side by side."""
+        listed = [(model_hash(model, parameters), model) for model in models]
+        new: dict[str, Mesh | CloudModel] = {}
+        with self._store.transaction():
+            for sha256, model in listed:
+                if sha256 not in new and not self._is_known(sha256, model.name):
+                    new[sha256] = model
+        with ThreadPoolExecutor(jobs) as threads:
+            built = {sha256: threads.submit(build_model, model, parameters) for sha256, model in new.items()}
+            try:
+                for sha256, model in listed:
+                    if sha256 in built:
+                        yield self.put(built.pop(sha256).result())
+                    else:
+                        yield self._join_placements(sha256, model.placements if isinstance(model, Mesh) else ())
+            finally:  # Ctrl-C waits for those being prepared, not for all
+                threads.shutdown(wait=False, cancel_futures=True)
 
     def put(self, model: Model) -> Model:
         """Keep a model that is prepared already, such as one of another library; otherwise as `add`."""

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import permutations, product
+from math import ceil
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.library.onto_itself import OntoItself, any_across, unit
+from scanfind.library.onto_itself import OVERLAP_SAMPLES, OntoItself, any_across, unit
 from scanfind.pose import Pose
 from scanfind.symmetry import Symmetry, pose_error
 
@@ -133,6 +134,8 @@ def _turned_and_shifted(model: OntoItself, axes: Floats) -> Iterator[Pose]:
     for turned in _turned(model, axes):
         yield turned
         rotation = turned.rotation
+        if not _fits(model, axes, rotation):
+            continue
         for shift in _shifts(model, axes, axes @ rotation @ axes.T, TURNED_SAMPLES)[:MOST_TURNED]:
             motion = Pose(rotation, model.centre + shift - rotation @ model.centre)
             off = float(np.linalg.norm(motion.translation - turned.translation))
@@ -144,6 +147,17 @@ def _turned_and_shifted(model: OntoItself, axes: Floats) -> Iterator[Pose]:
                 continue
             if all(each < TURNED_DIP * here for each in _aside(model, motion, axes)):
                 yield motion
+
+
+def _fits(model: OntoItself, axes: Floats, rotation: Floats) -> bool:
+    """Can enough of the model, turned, lie within the box along axes (3, 3) of what it was, wherever it is shifted to?
+    A wall across itself cannot, and most of what is tried is of this kind.
+    """
+    moved = np.sort(model.points[:OVERLAP_SAMPLES] @ rotation.T @ axes.T, axis=0)
+    asked = ceil(LEAST_TURNED * len(moved))
+    room = np.ptp(model.points @ axes.T, axis=0) + 4.0 * model.spacing  # that much off they lie on samples yet
+    taken = (moved[asked - 1 :] - moved[: len(moved) - asked + 1]).min(axis=0)
+    return bool((taken <= room).all())
 
 
 def _aside(model: OntoItself, motion: Pose, axes: Floats) -> Iterator[float]:

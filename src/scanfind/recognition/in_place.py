@@ -253,7 +253,8 @@ class InPlace:
 
         bests : of the place of each element, what the design has there, as it was found; beside : the same farther off
         """
-        alike, told = pairs_alike(self._ground.models), []
+        sides, told = np.array([sides_of(model) for model in self._ground.models]).reshape(-1, 3), []
+        alike, long = pairs_alike(sides), sides[:, 2]
         stand_ins: dict[tuple[int, int], Candidate | None] = {}
 
         def gain(here: int, there: int) -> float:
@@ -270,7 +271,7 @@ class InPlace:
             if tuple(sorted(bests[k].model for k in places)) not in alike:
                 continue
             # Of the longer one something is missing where the shorter stands: asked first, that costs nothing.
-            longer, shorter = sorted(places, key=lambda k: -sides_of(self._ground.models[bests[k].model])[-1])
+            longer, shorter = sorted(places, key=lambda k: -long[bests[k].model])
             if missing(bests[longer].evidence.spoken) < 0.5 * GAIN:
                 continue
             gains = gain(longer, shorter)

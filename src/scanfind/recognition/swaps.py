@@ -6,8 +6,7 @@ missing at its ends: each of them, asked alone, looks like itself. Asked togethe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import combinations, permutations, product
+from itertools import permutations, product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,16 +33,14 @@ def sides_of(model: Model) -> Floats:
     return np.sort(np.ptp(model.samples.points, axis=0))
 
 
-def are_alike(one: Model, other: Model) -> bool:
-    """Could one be taken for the other at a glance, and told from it at a second one?"""
-    here, there = sides_of(one), sides_of(other)
-    section, longer = np.abs(here - there)[:2].max(), abs(here[2] - there[2])
-    return bool(section < SECTION_M and LONGER_M < longer < LONGER * max(here[2], there[2]))
-
-
-def pairs_alike(models: Sequence[Model]) -> set[tuple[int, int]]:
-    """Numbers of the models that could be taken for each other, the lower first."""
-    return {(one, other) for one, other in combinations(range(len(models)), 2) if are_alike(models[one], models[other])}
+def pairs_alike(sides: Floats) -> set[tuple[int, int]]:
+    """Numbers of the models that could be taken for each other at a glance, and told apart at a second one, the lower
+    first; sides : (models, 3) of each, as `sides_of` has them.
+    """
+    one, other = np.triu_indices(len(sides), 1)
+    off, longest = np.abs(sides[one] - sides[other]), np.maximum(sides[one, 2], sides[other, 2])
+    alike = (off[:, :2].max(axis=1) < SECTION_M) & (off[:, 2] > LONGER_M) & (off[:, 2] < LONGER * longest)
+    return set(zip(one[alike].tolist(), other[alike].tolist(), strict=True))
 
 
 def onto(model: Model, other: Model) -> list[Pose]:

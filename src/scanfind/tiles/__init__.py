@@ -124,7 +124,7 @@ def find_in_tiles(
     say_if_compiling(tell)
     clock = Clock()
     with clock("library"):
-        library = models_of(models, parameters, units, select)
+        library = models_of(models, parameters, units, select, jobs, tell)
     listed = listed_of(scans, origin)
     with ExitStack() as stack:
         folder = Path(work).absolute() if work is not None else Path(mkdtemp(prefix="scanfind-"))
