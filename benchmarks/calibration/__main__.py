@@ -22,7 +22,7 @@ from benchmarks.ledger import Ledger, read_rows
 from benchmarks.paper.systems import warm_up
 from scanfind.errors import ScanfindError
 
-SEEDS = {"fit": "8000-8159", "held": "9000-9099"}
+SEEDS = {"fit": "8000-8390", "held": "9100-9454"}
 
 
 def main(part: str = "fit", seeds: str = "", out: Path = RESULTS, *, fresh: bool = False, date: str = "") -> None:
