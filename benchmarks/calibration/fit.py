@@ -41,7 +41,7 @@ def curve(rows: Sequence[Row]) -> Curve:
     knots: dict[float, float] = {}
     for group in pooled:
         for end in (group[0], group[-1]):
-            knots.setdefault(round(end.score, 4), round(share(group), 3))
+            knots.setdefault(round(end.score, 4), min(max(round(share(group), 3), 0.001), 0.999))
     return Curve(tuple(knots), tuple(knots.values()))
 
 
