@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import scanfind
 from scanfind.design.elements import INSTALLED, NO_DATA, NOT_FOUND, OCCLUDED
 from scanfind.grid.depth import LEAST_FILLED, Beams
-from scanfind.kernels.grid import NO_BEAM, RANGE_UNITS
+from scanfind.kernels.grid import NO_BEAM
 from scanfind.mesh import Placement
 from scanfind.parameters import PRESETS
 from scanfind.pose import Pose
@@ -49,7 +49,7 @@ def looks(beams: Beams, azimuth: float, elevation: float) -> tuple[bool, bool]:
 @settings(max_examples=8, deadline=None)
 def test_a_scanner_is_silent_through_a_window_and_not_where_it_may_not_have_looked(turned: float) -> None:
     beams = tower(turned)
-    assert beams.filled() > 0.9
+    assert beams.filled > 0.9
     assert looks(beams, turned + 1.2, 0.0) == (False, True)
     assert looks(beams, turned + 2.0, 0.0) == (True, False)
     assert looks(beams, turned + 1.2, HIGHEST + 0.1) == (False, False)
@@ -61,10 +61,15 @@ def test_silence_reaches_as_far_as_the_scanner_sees() -> None:
     beams = tower(0.5)
     silence = beams.silence()
     assert silence.reach == pytest.approx(5.0, abs=0.01)
-    into = beams.into_the_open(silence)
-    np.testing.assert_array_equal(into.nearest < NO_BEAM, beams.silent())
-    went = (into.nearest[into.nearest < NO_BEAM] >> 16) / RANGE_UNITS
+    about = np.random.default_rng(0).normal(size=(2000, 3)) + beams.origin
+    open_, filled = silence.towards(about, 0.3), beams.towards(about, 0.3)
+    assert beams.silent()[open_].all()
+    assert (beams.nearest[filled] < NO_BEAM).all()
+    assert len(np.unique(np.concatenate([open_, filled]))) == len(open_) + len(filled) > 1000
+    directions, went, angles = silence.beams_in(open_)
     np.testing.assert_allclose(went, silence.reach, atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
+    assert 0.5 < angles.mean() * len(beams.nearest) / (4.0 * np.pi) < 1.5
 
 
 def test_a_sector_that_was_not_scanned_is_not_silent_and_a_thin_scan_says_nothing() -> None:
@@ -74,7 +79,7 @@ def test_a_sector_that_was_not_scanned_is_not_silent_and_a_thin_scan_says_nothin
     faces[1] = NO_BEAM  # towards -x nothing was kept at all
     assert not aside.silent().reshape(6, -1)[1].reshape(beams.edge, beams.edge)[beams.edge // 2].any()
     thin = Beams(beams.origin, np.where(np.arange(len(beams.nearest)) % 7, NO_BEAM, beams.nearest), beams.edge)
-    assert thin.filled() < LEAST_FILLED
+    assert thin.filled < LEAST_FILLED
     assert not thin.silent().any()
 
 

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.evidence.rays import RayCaster
+from scanfind.grid.depth import LEAST_FILLED
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose
 
 if TYPE_CHECKING:
     from scanfind.evidence.neighbours import Design
-    from scanfind.grid.depth import Beams
+    from scanfind.grid.depth import Beams, Silence
     from scanfind.library.model import Model
 
 Floats = NDArray[np.float64]
@@ -80,13 +81,15 @@ def caster_of(model: Model) -> RayCaster:
     return RayCaster([(squares, Pose.identity())])
 
 
-def spoken_of(model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams], limits: Limits) -> Spoken:
+def spoken_of(
+    model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams | Silence], limits: Limits
+) -> Spoken:
     """What the beams of all scanners say of a model placed by scene_from_model, relative to the grid's offset."""
     return Spoken(*spoken_by_each(model, caster, placed, scanners, limits).sum(axis=0).tolist())
 
 
 def spoken_by_each(
-    model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams], limits: Limits,
+    model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams | Silence], limits: Limits,
     design: Design | None = None, offset: Floats | None = None, instead_of: str = "",
 ) -> Floats:  # fmt: skip
     """What the beams of each of S scanners say: rows as of `Spoken`, (S, 4), m²; for the rest see `verdicts`."""
@@ -110,7 +113,7 @@ class Verdicts(NamedTuple):
 
 
 def verdicts(
-    model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams], limits: Limits,
+    model: Model, caster: RayCaster, placed: Pose, scanners: Sequence[Beams | Silence], limits: Limits,
     design: Design | None = None, offset: Floats | None = None, instead_of: str = "",
 ) -> Verdicts:  # fmt: skip
     """What beams say of a model placed by scene_from_model, relative to the grid's offset, one by one.
@@ -187,30 +190,23 @@ class Towards(NamedTuple):
         return self.origins + self.directions * self.ranges[:, None]
 
 
-def towards(model: Model, placed: Pose, scanners: Sequence[Beams]) -> Towards:
+def towards(model: Model, placed: Pose, scanners: Sequence[Beams | Silence]) -> Towards:
     """The beams that go towards a placed model, MOST_BEAMS of them where there are more."""
     return beams_to(placed.move(model.samples.points), model.spacing, scanners, MOST_BEAMS)
 
 
-def beams_to(points: Floats, spacing: float, scanners: Sequence[Beams], most: float = np.inf) -> Towards:
+def beams_to(points: Floats, spacing: float, scanners: Sequence[Beams | Silence], most: float = np.inf) -> Towards:
     """The beams that go by points (N, 3) within their spacing, metres; `most` of them where there are more."""
-    from scanfind.kernels.beams import beams_of, pixels_towards
-
-    reach, pixels = REACH_SPACINGS * spacing, []
-    for scanner in scanners:
-        met, found = np.zeros(len(scanner.nearest), np.bool_), np.empty(len(scanner.nearest), np.int64)
-        count = pixels_towards(points, scanner.origin, reach, scanner.edge, scanner.nearest, met, found)
-        pixels.append(found[:count])
+    pixels = [scanner.towards(points, REACH_SPACINGS * spacing) for scanner in scanners]
     share = min(1.0, most / max(sum(map(len, pixels)), 1))
     asked_for = [Towards(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, np.intp))]
     for number, (scanner, some) in enumerate(zip(scanners, pixels, strict=True)):
-        asked = some[lots(some) < share]
-        directions, ranges, angles = np.empty((len(asked), 3)), np.empty(len(asked)), np.empty(len(asked))
-        beams_of(asked, scanner.nearest, scanner.edge, directions, ranges, angles)
-        # Each of those asked stands for as many as were left out.
+        directions, ranges, angles = scanner.beams_in(some[lots(some) < share])
+        # Each of those asked stands for those left out, and for those between it and the next that were never sent.
+        of_all = share * max(scanner.filled, LEAST_FILLED)
         origins = np.broadcast_to(scanner.origin, directions.shape)
-        whose = np.full(len(asked), number)
-        asked_for.append(Towards(origins, directions, ranges, angles / share, whose))
+        whose = np.full(len(ranges), number)
+        asked_for.append(Towards(origins, directions, ranges, angles / of_all, whose))
     return Towards(*(np.concatenate(column) for column in zip(*asked_for, strict=True)))
 
 

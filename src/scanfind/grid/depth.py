@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+NO_BEAMS, NO_BITS = np.empty(0, np.int64), np.empty(0, np.uint8)
 
 DEPTH_PIXELS = 360  # along an edge of the cube map: 0.25° a pixel, 35 mm at 8 m
 # Pixels are joined until the maps speak of this share of what they look at: of the samples they are silent about, those
@@ -22,18 +24,31 @@ LOOKED_AT = 45  # patches along an edge, of 2°: one with any range in it was lo
 
 
 class Silence(NamedTuple):
-    """Where a scanner looked and nothing came back.
+    """Where a scanner looked and nothing came back: beams that went as far as it sees.
 
-    where : (6 · edge² / 8,) uint8, a bit a pixel; filled : how often a surface brings something back (`Beams.filled`)
-    reach : how far the scanner sees, metres
+    origin, edge : see Beams; where : (6 · edge² / 8,) uint8, a bit a pixel; reach : how far it sees, metres
     """
 
+    origin: Floats
     where: NDArray[np.uint8]
-    filled: float
     reach: float
+    edge: int
+    filled: float = 1.0  # each is one of its own
+
+    def towards(self, points: Floats, reach: float) -> NDArray[np.int64]:
+        """The pixels within `reach` metres of points (N, 3) from which nothing came back."""
+        return pixels_in(points, self.origin, reach, self.edge, silent=self.where)
+
+    def beams_in(self, pixels: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
+        """Unit directions (B, 3), ranges and solid angles (B,) of the beams in some pixels (B,)."""
+        from scanfind.kernels.grid import RANGE_UNITS
+
+        went = (np.int64(self.reach * RANGE_UNITS) << 16) | PIXELS_MIDDLE
+        return unpacked_beams(pixels, np.full(len(pixels), went), self.edge)
 
 
-class Beams(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Beams:
     """The nearest beam that came back from each direction, exactly: beside which pixel it went tells what it missed.
 
     origin : (3,) where the scanner stood, relative to the grid's offset
@@ -53,7 +68,7 @@ class Beams(NamedTuple):
         from scanfind.kernels.grid import NO_BEAM
 
         filled = self.nearest < NO_BEAM
-        if self.filled() < LEAST_FILLED:
+        if self.filled < LEAST_FILLED:
             return np.zeros_like(filled)
         elevation, azimuth = angles_of(self.edge)
         low, high = elevation[filled].min(), elevation[filled].max()
@@ -68,16 +83,17 @@ class Beams(NamedTuple):
 
         ranges = (self.nearest[self.nearest < NO_BEAM] >> 16) / RANGE_UNITS
         reach = float(np.quantile(ranges, SEES)) if len(ranges) else 0.0
-        return Silence(np.packbits(self.silent()), self.filled(), reach)
+        return Silence(self.origin, np.packbits(self.silent()), reach, self.edge)
 
-    def into_the_open(self, silence: Silence) -> Beams:
-        """Beams that went as far as the scanner sees where it saw nothing; silence : its own."""
-        from scanfind.kernels.grid import NO_BEAM, RANGE_UNITS
+    def towards(self, points: Floats, reach: float) -> NDArray[np.int64]:
+        """The pixels within `reach` metres of points (N, 3) in which a beam came back."""
+        return pixels_in(points, self.origin, reach, self.edge, nearest=self.nearest)
 
-        silent = np.unpackbits(silence.where, count=len(self.nearest)).view(np.bool_)
-        went = (np.int64(silence.reach * RANGE_UNITS) << 16) | PIXELS_MIDDLE
-        return Beams(self.origin, np.where(silent, went, NO_BEAM), self.edge)
+    def beams_in(self, pixels: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
+        """Unit directions (B, 3), ranges and solid angles (B,) of the beams in some pixels (B,)."""
+        return unpacked_beams(pixels, self.nearest[pixels], self.edge)
 
+    @cached_property
     def filled(self) -> float:
         """The share of directions towards a surface that brought a beam back: of patches, that of the upper quarter."""
         from scanfind.kernels.grid import NO_BEAM
@@ -129,14 +145,31 @@ class DepthMap(NamedTuple):
 @lru_cache(maxsize=2)
 def angles_of(edge: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     """The elevation of each pixel's middle, radians, and its azimuth in AZIMUTHS steps, (6 · edge²,)."""
-    from scanfind.kernels.beams import beams_of
-
     every = np.arange(6 * edge**2)
-    ways, ranges, angles = np.empty((len(every), 3)), np.empty(len(every)), np.empty(len(every))
-    beams_of(every, np.full(len(every), PIXELS_MIDDLE), edge, ways, ranges, angles)
+    ways, _, _ = unpacked_beams(every, np.full(len(every), PIXELS_MIDDLE), edge)
     turn = np.arctan2(ways[:, 1], ways[:, 0]) / (2.0 * np.pi) % 1.0
     azimuth = np.minimum((turn * AZIMUTHS).astype(np.intp), AZIMUTHS - 1)
     return np.arcsin(np.clip(ways[:, 2], -1.0, 1.0)).astype(np.float32), azimuth
+
+
+def pixels_in(
+    points: Floats, origin: Floats, reach: float, edge: int, *, nearest: NDArray[np.int64] = NO_BEAMS,
+    silent: NDArray[np.uint8] = NO_BITS,
+) -> NDArray[np.int64]:  # fmt: skip
+    """The pixels about a scanner within `reach` metres of points (N, 3) that have a beam, or a bit: see the kernel."""
+    from scanfind.kernels.beams import pixels_towards
+
+    met, found = np.zeros(6 * edge**2, np.bool_), np.empty(6 * edge**2, np.int64)
+    return found[: pixels_towards(points, origin, reach, edge, nearest, silent, met, found)]
+
+
+def unpacked_beams(pixels: NDArray[np.int64], beams: NDArray[np.int64], edge: int) -> tuple[Floats, Floats, Floats]:
+    """Unit directions (B, 3), ranges and solid angles (B,) of packed beams (B,) in pixels (B,)."""
+    from scanfind.kernels.beams import beams_of
+
+    directions, ranges, angles = np.empty((len(pixels), 3)), np.empty(len(pixels)), np.empty(len(pixels))
+    beams_of(pixels, beams, edge, directions, ranges, angles)
+    return directions, ranges, angles
 
 
 def joined_until_spoken(maps: list[DepthMap]) -> list[DepthMap]:

@@ -9,10 +9,12 @@ from scanfind.kernels.jit import kernel
 
 
 @kernel
-def pixels_towards(points, origin, reach, edge, nearest, met, pixels):
+def pixels_towards(points, origin, reach, edge, nearest, silent, met, pixels):
     """The pixels within `reach` metres of points (N, 3) in which a scanner has a beam; returns how many.
 
-    nearest : (6·edge²,) the scanner's beams (kernels.grid.pack_beam); met : the same long, all False
+    nearest : (6·edge²,) the scanner's beams (kernels.grid.pack_beam); where it is empty, silent : (6·edge²/8,) uint8, a
+        bit for each pixel that counts
+    met : (6·edge²,) all False
     pixels : out, the first so many of at most 6·edge²
     """
     count = 0
@@ -28,7 +30,9 @@ def pixels_towards(points, origin, reach, edge, nearest, met, pixels):
         for iu in range(max(0, low_u), min(edge - 1, high_u) + 1):
             for iv in range(max(0, low_v), min(edge - 1, high_v) + 1):
                 pixel = (face * edge + iu) * edge + iv
-                if not met[pixel] and nearest[pixel] < NO_BEAM:
+                if met[pixel]:
+                    continue
+                if nearest[pixel] < NO_BEAM if len(nearest) else silent[pixel >> 3] >> (7 - (pixel & 7)) & 1:
                     met[pixel] = True
                     pixels[count] = pixel
                     count += 1
@@ -36,9 +40,9 @@ def pixels_towards(points, origin, reach, edge, nearest, met, pixels):
 
 
 @kernel
-def beams_of(pixels, nearest, edge, directions, ranges, angles):
-    """Unit directions (B, 3), ranges and solid angles (B,) of the beams in some pixels (B,)."""
+def beams_of(pixels, beams, edge, directions, ranges, angles):
+    """Unit directions (B, 3), ranges and solid angles (B,) of beams (B,) in pixels (B,)."""
     for i in range(pixels.shape[0]):
-        x, y, z, distance, angle = unpack_beam(pixels[i], nearest[pixels[i]], edge)
+        x, y, z, distance, angle = unpack_beam(pixels[i], beams[i], edge)
         directions[i, 0], directions[i, 1], directions[i, 2] = x, y, z
         ranges[i], angles[i] = distance, angle

@@ -115,9 +115,8 @@ class Witnesses:
             self._silences.extend(each.silence() for each in self.beams)
         caster, placed, found = self._caster(model), self._in_grid(pose), []
         for beams, silence, came in zip(self.beams, self._silences, said.sum(axis=1), strict=True):
-            into = beams.into_the_open(silence)
-            through = spoken_of(model, caster, placed, [into], self.limits).through
-            found.append(max(0.0, through - came * (1.0 / max(silence.filled, 1e-6) - 1.0)))
+            through = spoken_of(model, caster, placed, [silence], self.limits).through if silence.where.any() else 0.0
+            found.append(max(0.0, through - came * (1.0 - beams.filled)))
         return np.array(found)
 
     def elements(self, model: Model, detections: Sequence[Detection], stations: Floats) -> list[Element]:

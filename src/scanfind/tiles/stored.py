@@ -71,7 +71,7 @@ def reached(beams: Beams) -> Floats:
 
     seen = np.flatnonzero(beams.nearest < NO_BEAM)
     directions, ranges, angles = np.empty((len(seen), 3)), np.empty(len(seen)), np.empty(len(seen))
-    beams_of(seen, beams.nearest, beams.edge, directions, ranges, angles)
+    beams_of(seen, beams.nearest[seen], beams.edge, directions, ranges, angles)
     ends = np.concatenate([np.zeros((1, 3)), directions * ranges[:, None]])
     return np.array([ends.min(axis=0), ends.max(axis=0)]) + beams.origin
 
