@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scanfind.evidence.ends import FIXED, Slid, slid, with_faces
+from scanfind.evidence.ends import FIXED, Slid, comes_near, slid, with_faces
 from scanfind.evidence.free_space import Limits, caster_of, spoken_by_each
 from scanfind.grid.depth import Beams
 from scanfind.library.model import Model, ModelParameters, build_model
@@ -69,6 +71,26 @@ def test_of_what_was_moved_the_ends_are_believed_though_they_do_not_refute_the_d
     told = slid(model, caster_of(model), at(0.03), ALONG, None, bar_seen(moved), LIMITS)
     assert told is not None
     assert 0.03 + told.by == pytest.approx(moved, abs=max(FIXED * told.sigma, 0.005))
+
+
+def test_beams_that_end_before_it_say_nothing_and_are_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, screen = bar(), blocks("screen", [((0.5, -0.8, -1.0), (1.5, -0.75, 1.5))])
+    assert model.mesh is not None
+    beams = seen_of([(model.mesh, at(0.05)), (screen, Pose.identity())])
+    kept: list[int] = []
+
+    def told(keep: Callable[..., NDArray[np.intp]]) -> Slid | None:
+        def counted(*given: Any) -> NDArray[np.intp]:
+            near = keep(*given)
+            kept.append(len(near))
+            return near
+
+        monkeypatch.setattr("scanfind.evidence.ends.comes_near", counted)
+        return slid(model, caster_of(model), at(0.0), ALONG, 0.0, beams, LIMITS)
+
+    some, every = told(comes_near), told(lambda _, __, origins, *___: np.arange(len(origins)))
+    assert some == every is not None
+    assert 0 < kept[0] < 0.9 * kept[1]
 
 
 def test_faces_and_ends_are_weighed_where_they_agree_and_the_ends_believed_where_not() -> None:
