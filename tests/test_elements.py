@@ -23,6 +23,7 @@ from scanfind.design.elements import (
     OUT_OF_TOLERANCE,
     UNCERTAIN,
     assigned,
+    installed,
     off_by,
     status_at,
 )
@@ -79,6 +80,15 @@ def test_what_beams_say_of_a_place_makes_its_status(spoken: Spoken | None, statu
     told, why = status_at(spoken, 1.0)
     assert told == status
     assert why
+
+
+def test_of_what_has_few_points_beams_say_why_it_is_believed() -> None:
+    model = build_model(BRACKET, SMALL)
+    (place,), one, spoken = placed(BRACKET, at(0, 0)).placements, detection(1, at(0, 0)), Spoken(0.09, 0.01, 0.0, 3.0)
+    assert "50% of its surface lies on the scan" in installed(model, place, one, spoken).why
+    thin = replace(one, coverage=0.0)
+    assert "90% of what scanners looked at of it is there" in installed(model, place, thin, spoken).why
+    assert "0% of its surface lies on the scan" in installed(model, place, thin, None).why
 
 
 def test_each_detection_is_taken_for_the_place_nearest_to_it_and_once() -> None:

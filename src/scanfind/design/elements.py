@@ -163,6 +163,9 @@ def installed(model: Model, placement: Placement, found: Detection, spoken: Spok
         why = f"where it should be {there}; one of its shape stands {off:.2f} m off"
         return Element(placement, model.name, UNCERTAIN, found.id, (x, y, z), turn, off, *shares(spoken), why)
     why = f"found with score {found.score:.2f}: {found.coverage:.0%} of its surface lies on the scan"
+    looked = spoken.on + spoken.beside + spoken.through if spoken else 0.0
+    if spoken and found.coverage < LEAST_LOOKED_AT and spoken.on > 0.0:  # few points: surfels do not tell, beams do
+        why = f"found with score {found.score:.2f}: {spoken.on / looked:.0%} of what scanners looked at of it is there"
     if found.instead_of:
         why = f"{why}; it stands in the place of {found.instead_of}"
     further = off_by(model, model.samples.points, found.scene_from_model, design) - off
