@@ -101,9 +101,7 @@ def slid(
     return Slid(by, sigma)
 
 
-def comes_near(
-    model: Model, reach: Floats, origins: Floats, directions: Floats, ranges: Floats
-) -> NDArray[np.intp]:  # fmt: skip
+def comes_near(model: Model, reach: Floats, origins: Floats, directions: Floats, ranges: Floats) -> NDArray[np.intp]:
     """Which beams come into the box of a model swept by ± reach (3,); all in its own frame, metres."""
     corners = model.samples.points if model.mesh is None else model.mesh.vertices
     far = np.abs(reach) + model.spacing

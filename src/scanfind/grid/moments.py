@@ -10,7 +10,7 @@ import mmap
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial, reduce
 from itertools import pairwise
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,13 @@ from scanfind.cloud import PointChunk
 from scanfind.grid.depth import DEPTH_PIXELS, Beams
 from scanfind.threads import side_by_side
 
+if TYPE_CHECKING:
+    from scanfind.kernels.blocks import BlockRows
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 # Of one shard, as the kernels of the pass take them: its hash table, the arrays all share, its counts.
-Arrays: TypeAlias = tuple[Any, ...]
+Arrays: TypeAlias = "tuple[NDArray[Any] | BlockRows, ...]"
 
 # Room to begin with: 2, 134 and 470 MB of addresses, of which only what is written becomes memory. From 2^14 blocks and
 # 2^20 rows on, doubling took 0.9 s of a pass over 10 M points that needs 0.8 s.

@@ -66,12 +66,9 @@ def bins_of(keys: Ints, blocks: int) -> Ints:
 
 def reached(beams: Beams) -> Floats:
     """Low and high corner, (2, 3), of the box around a scanner and all that its nearest beams met."""
-    from scanfind.kernels.beams import beams_of
     from scanfind.kernels.grid import NO_BEAM
 
-    seen = np.flatnonzero(beams.nearest < NO_BEAM)
-    directions, ranges, angles = np.empty((len(seen), 3)), np.empty(len(seen)), np.empty(len(seen))
-    beams_of(seen, beams.nearest[seen], beams.edge, directions, ranges, angles)
+    directions, ranges, _ = beams.beams_in(np.flatnonzero(beams.nearest < NO_BEAM))
     ends = np.concatenate([np.zeros((1, 3)), directions * ranges[:, None]])
     return np.array([ends.min(axis=0), ends.max(axis=0)]) + beams.origin
 
