@@ -163,9 +163,9 @@ def installed(model: Model, placement: Placement, found: Detection, spoken: Spok
         why = f"where it should be {there}; one of its shape stands {off:.2f} m off"
         return Element(placement, model.name, UNCERTAIN, found.id, (x, y, z), turn, off, *shares(spoken), why)
     why = f"found with score {found.score:.2f}: {found.coverage:.0%} of its surface lies on the scan"
-    looked = spoken.on + spoken.beside + spoken.through if spoken else 0.0
     if spoken and found.coverage < LEAST_LOOKED_AT and spoken.on > 0.0:  # few points: surfels do not tell, beams do
-        why = f"found with score {found.score:.2f}: {spoken.on / looked:.0%} of what scanners looked at of it is there"
+        met = spoken.on / spoken.looked_at()
+        why = f"found with score {found.score:.2f}: {met:.0%} of what scanners looked at of it is there"
     if found.instead_of:
         why = f"{why}; it stands in the place of {found.instead_of}"
     further = off_by(model, model.samples.points, found.scene_from_model, design) - off
@@ -244,7 +244,7 @@ def status_at(spoken: Spoken | None, area: float) -> tuple[str, str]:
     if spoken is None:
         return UNCERTAIN, "not found, and no scanner position is known to tell missing from hidden: give --origin X,Y,Z"
     on, beside, through, hidden = spoken
-    asked, looked = sum(spoken), on + beside + through
+    asked, looked = sum(spoken), spoken.looked_at()
     if asked < LEAST_ASKED * area:
         return NO_DATA, "no beam of any scanner came near its place"
     if looked < LEAST_LOOKED_AT * area:

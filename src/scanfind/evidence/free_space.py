@@ -50,6 +50,10 @@ class Spoken(NamedTuple):
     through: float
     hidden: float
 
+    def looked_at(self) -> float:
+        """How much surface scanners looked at, m²."""
+        return self.on + self.beside + self.through
+
 
 class Limits(NamedTuple):
     """When a beam is on, beside, through.

@@ -134,7 +134,7 @@ class Evidence(NamedTuple):
 
     def visible_support(self) -> float:
         """Share of the surface the scanners could see that is there."""
-        seen = self.spoken.on + self.spoken.beside + self.spoken.through
+        seen = self.spoken.looked_at()
         return self.spoken.on / seen if seen else 0.0
 
 
@@ -174,8 +174,8 @@ def why_refused(evidence: Evidence, blind: bool, parameters: VerifyParameters, *
         return ""
     if blind:
         return f"{evidence.support():.0%} of its surface lies on the scan, and no free space is known to tell more"
-    on, beside, through, _ = evidence.spoken
-    seen = max(on + beside + through, 1e-300)
+    _, beside, through, _ = evidence.spoken
+    seen = max(evidence.spoken.looked_at(), 1e-300)
     if evidence.there(parameters, in_place=in_place) < parameters.min_score:
         if parameters.penalty_weight * through < parameters.beside_weight * beside:
             return f"{beside / seen:.0%} of the surface that scanners should have seen lies beside what they saw"

@@ -60,13 +60,8 @@ class ModelLibrary:
         A model known under another name keeps that name. Placements it brings join those known, by GlobalId. Raises
         LibraryError where another model has the name, InvalidGeometryError where the model has no surface.
         """
-        sha256 = model_hash(model, parameters)
-        with self._store.transaction():
-            known = self._is_known(sha256, model.name)
-        if known:
-            return self._join_placements(sha256, model.placements if isinstance(model, Mesh) else ())
-        # Outside any transaction, because it takes seconds: others go on meanwhile, and may add the same model.
-        return self.put(build_model(model, parameters))
+        (added,) = self.add_all([model], parameters)
+        return added
 
     def add_all(
         self, models: Iterable[Mesh | CloudModel], parameters: ModelParameters = DEFAULTS, jobs: int = 1
@@ -78,6 +73,7 @@ class ModelLibrary:
             for sha256, model in listed:
                 if sha256 not in new and not self._is_known(sha256, model.name):
                     new[sha256] = model
+        # Outside any transaction, because it takes seconds: others go on meanwhile, and may add the same model.
         with ThreadPoolExecutor(jobs) as threads:
             built = {sha256: threads.submit(build_model, model, parameters) for sha256, model in new.items()}
             try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -21,7 +22,6 @@ from scanfind.recognition.swaps import (
     GAIN,
     ROUGH_GAIN,
     explained,
-    looked_at,
     missing,
     more_explained,
     onto,
@@ -166,7 +166,7 @@ class InPlace:
             for shift in STANDS_OUT_M * across(pose, self._ground.models[found.model].samples.points)
         ]
         most = max(explained(self._weighing.spoken_of(found.model, each, in_place=True)) for each in beside)
-        return most < explained(said) - STANDS_OUT * looked_at(said)
+        return most < explained(said) - STANDS_OUT * said.looked_at()
 
     def _at_its_ends(self, found: Candidate) -> Candidate:
         """A pose as far along the length of its model as beams say; as it is where they do not."""
@@ -253,8 +253,7 @@ class InPlace:
 
         bests : of the place of each element, what the design has there, as it was found; beside : the same farther off
         """
-        sides, told = np.array([sides_of(model) for model in self._ground.models]).reshape(-1, 3), []
-        alike, long = pairs_alike(sides), sides[:, 2]
+        alike, long, told = self._alike, self._sides[:, 2], []
         stand_ins: dict[tuple[int, int], Candidate | None] = {}
 
         def gain(here: int, there: int) -> float:
@@ -303,6 +302,16 @@ class InPlace:
         better = max(asked, found, key=lambda each: explained(each.evidence.spoken))
         return better._replace(instead_of=place)
 
+    @cached_property
+    def _sides(self) -> Floats:
+        """Of each model, (models, 3): see `sides_of`."""
+        return np.array([sides_of(model) for model in self._ground.models]).reshape(-1, 3)
+
+    @cached_property
+    def _alike(self) -> set[tuple[int, int]]:
+        """The models that could stand in each other's place: see `pairs_alike`."""
+        return pairs_alike(self._sides)
+
     def why_not(self, candidate: Candidate) -> str:
         """Why an element is not believed to stand where the design puts it; empty where it is."""
         if self._looked_at_too_little(candidate):
@@ -312,7 +321,7 @@ class InPlace:
     def _looked_at_too_little(self, candidate: Candidate) -> bool:
         """Do beams say too little of a pose to be asked? One that hides within others nothing speaks against."""
         enough = LEAST_LOOKED_AT * self._ground.models[candidate.model].area
-        return not self._ground.blind and looked_at(candidate.evidence.spoken) < enough
+        return not self._ground.blind and candidate.evidence.spoken.looked_at() < enough
 
 
 def asked_of(models: Sequence[Model]) -> Asked:

@@ -60,16 +60,11 @@ def explained(spoken: Spoken) -> float:
     return spoken.on - spoken.beside - spoken.through
 
 
-def looked_at(spoken: Spoken) -> float:
-    """How much surface scanners looked at, m²."""
-    return spoken.on + spoken.beside + spoken.through
-
-
 def more_explained(instead: Spoken, stands: Spoken) -> float:
     """How much more one explains than another in the same place, as a share of what was looked at of that other."""
-    return (explained(instead) - explained(stands)) / max(looked_at(stands), 1e-300)
+    return (explained(instead) - explained(stands)) / max(stands.looked_at(), 1e-300)
 
 
 def missing(spoken: Spoken) -> float:
     """The share of the surface looked at that is not there."""
-    return (spoken.beside + spoken.through) / max(looked_at(spoken), 1e-300)
+    return (spoken.beside + spoken.through) / max(spoken.looked_at(), 1e-300)
