@@ -95,9 +95,12 @@ def shift_table(
     return table
 
 
-def spoken(triangles: Floats, ends: tuple[Floats, Floats], limits: Limits) -> Spoken:
-    """What beams from zero say of triangles (F, 3, 3), one by one; ends : of the beams (B, 3), solid angles (B,)."""
-    told = dict.fromkeys(Spoken._fields, 0.0)
+def spoken(triangles: Floats, ends: tuple[Floats, Floats], limits: Limits) -> tuple[Spoken, float]:
+    """What beams from zero say of triangles (F, 3, 3), one by one; ends : of the beams (B, 3), solid angles (B,).
+
+    And what those stand for that pass an edge so near that it depends on where about the beam one looks for it.
+    """
+    told, doubtful = dict.fromkeys(Spoken._fields, 0.0), 0.0
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     for end, angle in zip(*ends, strict=True):
@@ -112,11 +115,14 @@ def spoken(triangles: Floats, ends: tuple[Floats, Floats], limits: Limits) -> Sp
         elif far > distance + limits.margin:
             side = np.cross(way, [1.0, 0.0, 0.0] if abs(way[0]) < 0.6 else [0.0, 1.0, 0.0])
             side *= limits.inlier / np.linalg.norm(side)
-            sides = [side, -side, np.cross(way, side), -np.cross(way, side)]
-            if any(first_hit(start, way, triangles)[0] >= far - limits.margin for start in sides):
+            turns = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
+            about = np.outer(np.cos(turns), side) + np.outer(np.sin(turns), np.cross(way, side))
+            past = [first_hit(start, way, triangles)[0] >= far - limits.margin for start in about]
+            if any(past):
+                doubtful += 0.0 if all(past) else angle * distance**2 / cosine
                 continue
             what = "through"
         else:
             what = "hidden" if far < distance - limits.margin else "beside"
         told[what] += angle * distance**2 / cosine
-    return Spoken(**told)
+    return Spoken(**told), doubtful
