@@ -21,7 +21,6 @@ from scanfind.grid.scene import Scene, build_scene
 from scanfind.grid.surfels import number
 from scanfind.kernels.blocks import unpack_block
 from scanfind.kernels.lines import fit_lines, lines_of_samples
-from scanfind.library import joint_table
 from scanfind.library.model import Model, ModelParameters, build_model
 from scanfind.library.surface import SurfaceParameters
 from scanfind.parameters import PRESETS, Parameters
@@ -204,7 +203,7 @@ def test_three_hundred_points_of_a_frame_and_nothing_else_are_enough() -> None:
 
 
 def recognition() -> Recognition:
-    return Recognition(hall_scene(), [frame()], joint_table([frame()]), Parameters(), 0, 1)
+    return Recognition(hall_scene(), [frame()], Parameters(), 0, 1)
 
 
 @pytest.mark.parametrize("by_lines", [True, False])

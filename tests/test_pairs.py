@@ -154,11 +154,11 @@ def test_normals_along_the_pair_leave_the_roll_open(seed: int, length: float, si
 
 
 def key_of(feature: Floats, parameters: PairParameters) -> int:
-    return int(feature_key(*feature.tolist(), parameters.angle_cell(), parameters.angle_bins()))
+    return int(feature_key(*np.cos(feature).tolist(), parameters.edges))
 
 
 def off_the_borders(feature: Floats, parameters: PairParameters) -> bool:
-    share = feature / parameters.angle_cell()
+    share = np.degrees(feature) / parameters.angle_cell_deg
     return bool((np.abs(share - share.round()) > 1e-6).all())
 
 
@@ -173,12 +173,12 @@ def test_keys_are_the_feature_s_cell_and_no_motion_changes_them(seed: int, angle
     if not off_the_borders(feature, parameters):
         return
     bins = parameters.angle_bins()
-    b1, b2, b3 = (int(angle // parameters.angle_cell()) for angle in feature)
+    b1, b2, b3 = (int(np.degrees(angle) // parameters.angle_cell_deg) for angle in feature)
     for p, n, q, m in (pair, moved(some_pose(rng), pair)):
         keys = np.empty(1, np.int64)
         ends, normals = np.stack([p, q]), np.stack([n, m])
         numbers = np.array([0]), np.array([1]), np.array([0])
-        key_pairs(*numbers, ends, normals, parameters.angle_cell(), bins, keys)
+        key_pairs(*numbers, ends, normals, parameters.edges, keys)
         assert keys[0] == (b1 * bins + b2) * bins + b3
     assert keys[0] < parameters.cells_per_rung()
 
@@ -189,7 +189,7 @@ def test_signs_turn_the_normals(seed: int) -> None:
     p, n, q, m = some_pair(np.random.default_rng(seed))
     parameters = PairParameters()
     keys, numbers = np.empty(4, np.int64), (np.zeros(4, np.int64), np.ones(4, np.int64), np.arange(4))
-    key_pairs(*numbers, np.stack([p, q]), np.stack([n, m]), parameters.angle_cell(), parameters.angle_bins(), keys)
+    key_pairs(*numbers, np.stack([p, q]), np.stack([n, m]), parameters.edges, keys)
     for k, (one, two) in enumerate([(1, 1), (-1, 1), (1, -1), (-1, -1)]):
         feature = naive.feature(p, one * n, q, two * m)
         if off_the_borders(feature, parameters):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scanfind.grid.air import Air, no_air
 from scanfind.kernels.search import lie_on_scene
-from scanfind.library import JointTable, joint_table
+from scanfind.library.joint import JointTable, joint_table
 from scanfind.library.model import Model, build_model
 from scanfind.priors import Priors
 from scanfind.priors.allowed import allowed_poses
@@ -42,7 +42,7 @@ def table() -> JointTable:
 @cache
 def drawn() -> tuple[Draws, Pairs]:
     pool = Pool(scene(), models(), by_shape=True, seed=0, jobs=1)
-    search = Search(scene(), models(), table(), model_arrays(models()), SearchParameters(), 0, 1)
+    search = Search(scene(), models(), model_arrays(models()), SearchParameters(), 0, 1)
     draws = Draws(pool.points(), search.pairs, search.rungs, 0.02, 1)
     return draws, affordable(draws.draw(500, 0, 0, 1000), np.diff(table().offsets), 30_000, rarest_first=True)
 
@@ -106,7 +106,7 @@ def test_what_a_pair_costs_is_counted_of_the_models_sought() -> None:
 
 def test_a_model_that_is_served_is_tested_no_more_and_lines_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(served, "MODELS_A_ROUND", 2)
-    search = Search(scene(), models(), table(), model_arrays(models()), SearchParameters(), 0, 1)
+    search = Search(scene(), models(), model_arrays(models()), SearchParameters(), 0, 1)
     search.served.lines_asked(np.array([4.7, 0.0, 4.7]))
     found = search.round()
     assert set(found.models.tolist()) == {1}
@@ -124,7 +124,7 @@ def test_a_long_round_draws_from_new_surfels_again_and_again(monkeypatch: pytest
 
     monkeypatch.setattr(Pool, "fill", noted)
     monkeypatch.setattr(served.Served, "share", lambda self: 2.5 * surface.A_CHOICE)
-    search = Search(scene(), models(), table(), model_arrays(models()), SearchParameters(), 0, 1)
+    search = Search(scene(), models(), model_arrays(models()), SearchParameters(), 0, 1)
     found = search.round()
     assert len(drawn_from) == 3  # the first was chosen when the search began
     assert len({surfels.tobytes() for surfels in drawn_from}) == 3

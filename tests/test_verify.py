@@ -21,7 +21,6 @@ from scanfind.grid.depth import LEAST_FILLED, LEAST_SPOKEN, Beams, DepthMap, joi
 from scanfind.grid.moments import MomentGrid
 from scanfind.grid.scene import GridParameters, Scene, build_scene
 from scanfind.kernels.grid import AIM_UNITS, NO_BEAM, RANGE_UNITS, cube_pixel, cube_place, pack_beam, unpack_beam
-from scanfind.library import joint_table
 from scanfind.library.model import Model, ModelParameters, build_model
 from scanfind.library.surface import SurfaceParameters
 from scanfind.parameters import PRESETS
@@ -70,7 +69,7 @@ def scene(known: bool = True) -> Scene:
 def weigh(place: tuple[float, float, float], turn: Floats | None = None, known: bool = True) -> Candidate:
     """The evidence for a box at a place."""
     models = [box()]
-    found = Recognition(scene(known), models, joint_table(models), PARAMETERS, 0, 1)
+    found = Recognition(scene(known), models, PARAMETERS, 0, 1)
     rotation = np.eye(3) if turn is None else turn
     pose = Hypotheses(np.zeros(1, np.int64), rotation[None], np.array([place]), np.ones(1))
     return found.weighing.candidates(Refined(pose, np.eye(6)[None], np.ones(1), np.zeros(1)))[0]
@@ -257,7 +256,7 @@ def corners_of(model: Model) -> Floats:
 
 def test_evidence_is_each_pose_s_own() -> None:
     models, places = [box()], [ON_THE_BOX, (2.0, 0.7, 0.0), (5.0, 0.0, 0.0), (2.0, 3.0, 0.0)]
-    found = Recognition(scene(), models, joint_table(models), PARAMETERS, 0, 2)
+    found = Recognition(scene(), models, PARAMETERS, 0, 2)
     poses = Hypotheses(np.zeros(4, np.int64), np.tile(np.eye(3), (4, 1, 1)), np.array(places), np.ones(4))
     together = found.weighing.candidates(Refined(poses, np.zeros((4, 6, 6)), np.ones(4), np.zeros(4)))
     for one, place in zip(together, places, strict=True):
@@ -302,10 +301,7 @@ def test_a_depth_map_speaks_where_its_pixels_are_filled(share: float) -> None:
 
 def test_thin_places_are_asked_on_the_coarse_level() -> None:
     # A tenth of the beams: most fine cells on the box are empty, the coarse ones hold a point or two.
-    sparse, dense = (
-        weigh_in(Recognition(at, [box()], joint_table([box()]), PARAMETERS, 0, 1))
-        for at in (thinned(0.04), scene(True))
-    )
+    sparse, dense = (weigh_in(Recognition(at, [box()], PARAMETERS, 0, 1)) for at in (thinned(0.04), scene(True)))
     assert dense[0] == dense[1]
     assert sparse[0] > 1.3 * sparse[1] > 0
 

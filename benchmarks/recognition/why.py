@@ -12,7 +12,6 @@ from benchmarks.recognition.trial import Trial
 from scanfind.evidence.verify import distances, outlines, why_refused
 from scanfind.grid.moments import MomentGrid
 from scanfind.grid.scene import build_scene, first_cell
-from scanfind.library import joint_table
 from scanfind.library.model import Model
 from scanfind.parameters import PRESETS
 from scanfind.pose import Pose
@@ -58,7 +57,7 @@ def searched(trial: Trial) -> tuple[Recognition, Hypotheses]:
     for chunk in Sources(trial.scanned.stations).chunks():
         grid.add(chunk)
     scene = build_scene(grid, min(diameters), parameters.grid, parameters.search.test_cells_across, jobs)
-    search = Recognition(scene, models, joint_table(models), parameters, trial.seed, jobs)
+    search = Recognition(scene, models, parameters, trial.seed, jobs)
     return search, search.search.round()
 
 

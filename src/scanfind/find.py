@@ -12,7 +12,6 @@ from scanfind.fit.polish import polished
 from scanfind.grid.moments import MomentGrid
 from scanfind.grid.scene import build_scene, without_sparse_levels
 from scanfind.isolation.own import isolation_gate, with_own_points
-from scanfind.library import joint_table
 from scanfind.parameters import PRESETS, Parameters
 from scanfind.priors.allowed import box_searched, require_points_in
 from scanfind.recognition.in_place import asked_of
@@ -180,9 +179,7 @@ def begin(
     with clock("grid"):
         smallest = min(model.diameter for model in size.models)
         scene = build_scene(grid, smallest, parameters.grid, parameters.search.test_cells_across, jobs)
-    with clock("library"):
-        table = joint_table(size.models, each_once=parameters.search.each_once)
-    found = Recognition(scene, size.models, table, parameters, seed, jobs, standing, asked, learnt)
+    found = Recognition(scene, size.models, parameters, seed, jobs, standing, asked, learnt)
     for hypotheses in found.at_design():
         with clock("refine"):
             poses = found.refine_in_place(hypotheses)

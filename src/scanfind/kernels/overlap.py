@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from scanfind.kernels.jit import kernel
 from scanfind.kernels.placed import placed
 
 
 @kernel
-def self_overlap(points, normals, signed, some, rotation, translation, reach):
+def self_overlap(points, normals, some, onto, onto_normals, along_axis, axis, signed, rotation, translation, reach):
     """Share of the first `some` samples that a motion brings within `reach` metres of a sample with a like normal.
 
+    onto, onto_normals : the samples sorted along a coordinate axis, where they are at along_axis (N,)
     signed : False where nobody knows which way the normals face
     """
     hits = 0
     for i in range(some):
         x, y, z, nx, ny, nz = placed(points, normals, i, rotation, translation)
-        for j in range(points.shape[0]):
-            dx, dy, dz = points[j, 0] - x, points[j, 1] - y, points[j, 2] - z
-            along = nx * normals[j, 0] + ny * normals[j, 1] + nz * normals[j, 2]
+        here = x if axis == 0 else y if axis == 1 else z
+        for j in range(np.searchsorted(along_axis, here - reach), onto.shape[0]):
+            if along_axis[j] > here + reach:
+                break
+            dx, dy, dz = onto[j, 0] - x, onto[j, 1] - y, onto[j, 2] - z
+            along = nx * onto_normals[j, 0] + ny * onto_normals[j, 1] + nz * onto_normals[j, 2]
             if dx * dx + dy * dy + dz * dz <= reach * reach and (along if signed else abs(along)) > 0.7:
                 hits += 1
                 break

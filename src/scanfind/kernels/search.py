@@ -8,7 +8,7 @@ import numpy as np
 
 from scanfind.kernels.allowed import may_be
 from scanfind.kernels.blocks import block_in, find_block, insert_block, pack_block, unpack_block
-from scanfind.kernels.features import angle_between, feature_key
+from scanfind.kernels.features import feature_key
 from scanfind.kernels.grid import cube_pixel
 from scanfind.kernels.jit import kernel
 from scanfind.kernels.pair_pose import frame_of_pair, place_pair, pose_from_frames, refine_four_points
@@ -105,7 +105,7 @@ def count_partners(some, points, distance, tolerance):
 
 
 @kernel
-def key_pairs(first, second, signs, means, normals, angle_cell, angle_bins, keys):
+def key_pairs(first, second, signs, means, normals, edges, keys):
     """The feature cell of each of K scene pairs, -1 for a pair that is none; signs: bit 0 turns n1, bit 1 turns n2."""
     for k in range(first.shape[0]):
         keys[k] = -1
@@ -120,9 +120,8 @@ def key_pairs(first, second, signs, means, normals, angle_cell, angle_bins, keys
         sa, sb = 1.0 - 2.0 * (signs[k] & 1), 1.0 - (signs[k] & 2)
         ax, ay, az = sa * normals[p, 0], sa * normals[p, 1], sa * normals[p, 2]
         bx, by, bz = sb * normals[q, 0], sb * normals[q, 1], sb * normals[q, 2]
-        f1, f2 = angle_between(ax, ay, az, dx, dy, dz), angle_between(bx, by, bz, dx, dy, dz)
-        f3 = angle_between(ax, ay, az, bx, by, bz)
-        keys[k] = feature_key(f1, f2, f3, angle_cell, angle_bins)
+        c1, c2 = ax * dx + ay * dy + az * dz, bx * dx + by * dy + bz * dz
+        keys[k] = feature_key(c1, c2, ax * bx + ay * by + az * bz, edges)
 
 
 @kernel

@@ -5,12 +5,13 @@ Models accumulate in one SQLite file. A model already there, by a hash of its ge
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
+from math import inf
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from scanfind.cloud import CloudModel, OrientedCloud
 from scanfind.errors import LibraryError, ScanfindError
 from scanfind.library.model import DEFAULTS, Model, ModelParameters, ModelSummary, build_model, model_hash
-from scanfind.library.pairs import PairParameters, PairTable, key_count
+from scanfind.library.pairs import PairParameters
 from scanfind.library.self_similar import Similar
 from scanfind.library.store import Record, Store
 from scanfind.library.surface import SurfaceParameters
@@ -26,7 +27,7 @@ from scanfind.mesh import Mesh, Placement
 from scanfind.pose import Pose
 from scanfind.symmetry import Axis, Symmetry
 
-__all__ = ["JointTable", "Model", "ModelLibrary", "ModelParameters", "ModelSummary", "joint_table"]
+__all__ = ["Model", "ModelLibrary", "ModelParameters", "ModelSummary"]
 
 
 class ModelLibrary:
@@ -220,7 +221,7 @@ def _facts(model: Model) -> dict[str, Any]:
         "area": model.area,
         "signed": model.signed,
         "samples": len(model.samples),
-        "pairs": len(model.pairs.keys),
+        "pairs": model.pair_count,
         "triangles": len(model.mesh.faces) if model.mesh else 0,
         "parameters": asdict(model.parameters),
         "symmetry": {"centre": model.symmetry.centre.tolist(), "axes": model.symmetry.axes},
@@ -260,7 +261,6 @@ def _arrays(model: Model) -> dict[str, NDArray[Any]]:
     arrays: dict[str, NDArray[Any]] = {
         "points": model.samples.points,
         "normals": model.samples.normals,
-        **model.pairs._asdict(),
     }
     if model.mesh:
         arrays["vertices"] = np.asarray(model.mesh.vertices, np.float64)
@@ -292,25 +292,22 @@ def _model(record: Record, arrays: Mapping[str, NDArray[Any]]) -> Model:
     else:
         origin = _shaped(arrays["origin"], np.float64, (3,)) if "origin" in arrays else None
         cloud = CloudModel(record.name, _shaped(arrays["cloud"], np.float64, (-1, 3)), facts["source"], origin)
+    sizes = [float(facts[what]) for what in ("diameter", "spacing", "area")]
+    if not all(0.0 < size < inf for size in sizes):  # distances of pairs are shares of them
+        raise ValueError(sizes)
     points, normals = (_shaped(arrays[role], np.float64, (-1, 3)) for role in ("points", "normals"))
     samples = OrientedCloud(points, _shaped(normals, np.float64, points.shape), facts["signed"])
-    # The kernels trust what they get: an index out of range would read foreign memory.
-    keys = _within(_shaped(arrays["keys"], np.int32, (-1,)), key_count(parameters.pairs))
-    ends = (_within(_shaped(arrays[role], np.int32, keys.shape), len(points)) for role in ("first", "second"))
-    if (np.diff(keys) < 0).any():
-        raise ValueError(keys)
     return Model(
         name=record.name,
         sha256=record.sha256,
         source=facts["source"],
-        diameter=float(facts["diameter"]),
-        spacing=float(facts["spacing"]),
-        area=float(facts["area"]),
+        diameter=sizes[0],
+        spacing=sizes[1],
+        area=sizes[2],
         signed=bool(facts["signed"]),
         samples=samples,
         mesh=mesh,
         cloud=cloud,
-        pairs=PairTable(keys, *ends),
         symmetry=_symmetry(facts["symmetry"]),
         similar=tuple(Similar(float(each["overlap"]), _pose(each)) for each in facts["similar"]),
         placements=placements,
@@ -329,59 +326,3 @@ def _within(indices: NDArray[Any], end: int) -> NDArray[Any]:
     if indices.size and not 0 <= indices.min() <= indices.max() < end:
         raise ValueError(end)
     return indices
-
-
-class JointTable(NamedTuple):
-    """The pairs of several models by key, in CSR form: pairs offsets[k] … offsets[k + 1] have key k.
-
-    offsets : (C + 1,) int64 over the C keys
-    model, first, second : (K,) int32, the model's place in the list and its two samples; sorted by model within a key
-    """
-
-    offsets: NDArray[np.int64]
-    model: NDArray[np.int32]
-    first: NDArray[np.int32]
-    second: NDArray[np.int32]
-
-    def entries_of(self, models: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """How many pairs of some models, (models,), have each key, (C,)."""
-        if models.all():
-            return np.diff(self.offsets)
-        before = np.concatenate([[0], np.cumsum(models[self.model], dtype=np.int64)])
-        return np.diff(before[self.offsets])
-
-
-def joint_table(models: Sequence[Model], *, each_once: bool = False) -> JointTable:
-    """One hash table for all models, so that a pair of scene points is looked up once (paper 3.4).
-
-    each_once : of pairs that a model's symmetry maps onto one another only one: their hypotheses look the same
-
-    Raises LibraryError for no models, or models whose keys do not mean the same.
-    """
-    layouts = {(m.parameters.pairs.angle_cell_deg, m.parameters.pairs.rungs_per_octave) for m in models}
-    if len(layouts) != 1:
-        what = f"(angle_cell_deg, rungs_per_octave) {sorted(layouts)}" if layouts else "no models"
-        msg = f"models searched together must share one layout of keys, got {what}; add them with the same parameters"
-        raise LibraryError(msg)
-    cells = key_count(models[0].parameters.pairs)
-    tables = [pairs_once(m) if each_once else m.pairs for m in models]
-    offsets = np.zeros(cells + 1, np.int64)
-    for pairs in tables:
-        offsets[1:] += np.bincount(pairs.keys, minlength=cells)
-    np.cumsum(offsets, out=offsets)
-    table = JointTable(offsets, *(np.empty(offsets[-1], np.int32) for _ in range(3)))
-    # Each model's keys are sorted already: a pair goes to its cell's next free place plus its rank within the cell.
-    free = offsets[:-1].copy()
-    for number, pairs in enumerate(tables):
-        counts = np.bincount(pairs.keys, minlength=cells)
-        starts = np.cumsum(counts) - counts
-        place = (free - starts)[pairs.keys] + np.arange(len(pairs.keys))
-        table.model[place], table.first[place], table.second[place] = number, pairs.first, pairs.second
-        free += counts
-    return table
-
-
-def pairs_once(model: Model) -> PairTable:
-    """The pairs of a model but for those that its symmetry makes of others: whose first sample stands for its like."""
-    kept = model.symmetry.stands_for_its_like(model.samples.points)[model.pairs.first]
-    return PairTable(*(column[kept] for column in model.pairs))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from scanfind.cloud import CloudModel, OrientedCloud
 from scanfind.library.cloud_surface import sample_cloud
 from scanfind.library.onto_itself import OntoItself
-from scanfind.library.pairs import PairParameters, PairTable, build_pairs
+from scanfind.library.pairs import PairParameters, PairTable, build_pairs, pair_count, require_apart
 from scanfind.library.self_similar import Similar, find_similar
 from scanfind.library.surface import SurfaceParameters, sample_mesh
 from scanfind.library.symmetries import declared_symmetry, find_symmetry
@@ -54,7 +55,6 @@ class Model:
     samples : (N,) oriented points a scanner could see, model frame, every prefix evenly spread
     mesh : the triangles, for isolation; None for a model that is a piece of scan
     cloud : that piece of scan; None for a mesh
-    pairs : the oriented pairs of the samples with their keys
     symmetry : the rotations after which no scan could tell that it was turned
     similar : motions after which it could be taken for itself, though it is not, likeliest first
     placements : the design's products of this geometry
@@ -70,11 +70,20 @@ class Model:
     samples: OrientedCloud
     mesh: Mesh | None
     cloud: CloudModel | None
-    pairs: PairTable
     symmetry: Symmetry
     similar: tuple[Similar, ...]
     placements: tuple[Placement, ...]
     parameters: ModelParameters
+
+    @cached_property
+    def pairs(self) -> PairTable:
+        """The oriented pairs of the samples with their keys: made when a search first asks for them (decision 35)."""
+        return build_pairs(self.samples, self.diameter, self.spacing, self.parameters.pairs)
+
+    @cached_property
+    def pair_count(self) -> int:
+        """How many pairs there are, whether or not anybody has asked for them."""
+        return pair_count(self.samples, self.diameter, self.spacing, self.parameters.pairs)
 
     def area_of_a_sample(self) -> float:
         """The surface a sample stands for, m²."""
@@ -112,7 +121,7 @@ def model_hash(model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS)
 
 
 def build_model(model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS) -> Model:
-    """Sample a model's surface and hash its pairs (Algorithm 1). Raises InvalidGeometryError."""
+    """Sample a model's surface, and find what it could be taken for. Raises InvalidGeometryError."""
     if isinstance(model, Mesh):
         surface = sample_mesh(model, parameters.surface)
         # Of the notes, which are for the person who reads the file, the library keeps what the fit of parts needs.
@@ -121,6 +130,7 @@ def build_model(model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS
     else:
         surface = sample_cloud(model, parameters.surface)
         mesh, cloud = None, model
+    require_apart(len(surface.samples), surface.diameter)
     itself = OntoItself(surface, mesh)
     declared = parameters.symmetry
     symmetry = find_symmetry(itself) if declared is None else declared_symmetry(itself, parse_axes(declared))
@@ -135,7 +145,6 @@ def build_model(model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS
         samples=surface.samples,
         mesh=mesh,
         cloud=cloud,
-        pairs=build_pairs(surface.samples, surface.diameter, surface.spacing, parameters.pairs),
         symmetry=symmetry,
         similar=find_similar(itself, symmetry),
         placements=mesh.placements if mesh else (),

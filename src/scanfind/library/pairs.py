@@ -10,6 +10,7 @@ octave; a model uses the rungs next to the shares of its diameter it asks for, a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from math import ceil, log2, radians
 from typing import NamedTuple
 
@@ -53,9 +54,10 @@ class PairParameters:
         """Cells along each of the three angles."""
         return ceil(180.0 / self.angle_cell_deg - 1e-9)
 
-    def angle_cell(self) -> float:
-        """Δθ, radians."""
-        return radians(self.angle_cell_deg)
+    @cached_property
+    def edges(self) -> NDArray[np.float64]:
+        """The cosines of the angles at which one cell ends and the next begins, (angle_bins - 1,)."""
+        return np.asarray(np.cos(radians(self.angle_cell_deg) * np.arange(1, self.angle_bins())))
 
     def cells_per_rung(self) -> int:
         """Hash cells of one distance."""
@@ -96,24 +98,41 @@ def build_pairs(samples: OrientedCloud, diameter: float, spacing: float, paramet
 
     Raises InvalidGeometryError for a model with fewer than two samples.
     """
-    from scanfind.kernels.features import count_pairs, fill_pairs
+    from scanfind.kernels.features import fill_pairs, sort_pairs
 
-    if len(samples) < 2 or not diameter > 0.0:
-        msg = f"pairs need at least two samples apart from each other, got {len(samples)} over {diameter} m"
-        raise InvalidGeometryError(msg)
-    parts = []
+    require_apart(len(samples), diameter)
+    points, normals = np.ascontiguousarray(samples.points.T), np.ascontiguousarray(samples.normals.T)
+    cells, parts = parameters.cells_per_rung(), []
     for rung in rungs_of(diameter, parameters):
         shell = rung_distance(rung, parameters), parameters.tolerance * spacing
-        counts = np.empty(len(samples), np.int64)
-        count_pairs(samples.points, *shell, counts)
+        counts = _partners(points, *shell)
         ends = np.cumsum(counts)
-        keys, first, second = (np.empty(ends[-1], np.int32) for _ in range(3))
-        fill_pairs(
-            samples.points, samples.normals, *shell, parameters.angle_cell(), parameters.angle_bins(),
-            ends - counts, keys, first, second,
-        )  # fmt: skip
-        keys += rung * parameters.cells_per_rung()
-        order = np.argsort(keys, kind="stable")
-        parts.append((keys[order], first[order], second[order]))
+        found, in_order = (PairTable(*(np.empty(ends[-1], np.int32) for _ in range(3))) for _ in range(2))
+        fill_pairs(points, normals, *shell, parameters.edges, ends - counts, *found)
+        sort_pairs(*found, np.zeros(cells + 1, np.int64), *in_order)
+        parts.append(in_order._replace(keys=in_order.keys + np.int32(rung * cells)))
     parts.reverse()  # lowest rung first: then the concatenation is sorted by key
     return PairTable(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def pair_count(samples: OrientedCloud, diameter: float, spacing: float, parameters: PairParameters) -> int:
+    """How many pairs `build_pairs` makes, at a fifth of the cost."""
+    points, tolerance = np.ascontiguousarray(samples.points.T), parameters.tolerance * spacing
+    rungs = rungs_of(diameter, parameters)
+    return sum(int(_partners(points, rung_distance(rung, parameters), tolerance).sum()) for rung in rungs)
+
+
+def _partners(points: NDArray[np.float64], distance: float, tolerance: float) -> NDArray[np.int64]:
+    """How many of points (3, N) lie at distance ± tolerance from each, (N,)."""
+    from scanfind.kernels.features import count_pairs
+
+    counts = np.empty(points.shape[1], np.int64)
+    count_pairs(points, distance, tolerance, counts)
+    return counts
+
+
+def require_apart(samples: int, diameter: float) -> None:
+    """Raise InvalidGeometryError for a surface too small for a pair: so many samples within so many metres."""
+    if samples < 2 or not diameter > 0.0:
+        msg = f"pairs need at least two samples apart from each other, got {samples} over {diameter} m"
+        raise InvalidGeometryError(msg)

@@ -29,7 +29,6 @@ from scanfind.search.surface import Search
 if TYPE_CHECKING:
     from scanfind.fit.refine import Refined
     from scanfind.grid.scene import Scene
-    from scanfind.library import JointTable
     from scanfind.library.model import Model
     from scanfind.parameters import Parameters
     from scanfind.recognition.in_place import Asked
@@ -58,14 +57,12 @@ class Recognition:
     """
 
     def __init__(
-        self, scene: Scene, models: Sequence[Model], table: JointTable, parameters: Parameters, seed: int, jobs: int,
+        self, scene: Scene, models: Sequence[Model], parameters: Parameters, seed: int, jobs: int,
         standing: Sequence[Standing] = (), asked: Asked | None = None, learnt: Sequence[float] = (),
     ) -> None:  # fmt: skip
         """Take a scene; standing : instances of larger models; asked, learnt : see `find.recognise`."""
         self.ground = ground = Ground(scene, models, model_arrays(models), parameters, jobs)
-        self.search = Search(
-            scene, models, table, ground.arrays, parameters.search, seed, jobs, learnt, parameters.priors
-        )
+        self.search = Search(scene, models, ground.arrays, parameters.search, seed, jobs, learnt, parameters.priors)
         self.weighing = Weighing(ground, self.search.pool.telling(), asked.shadows if asked else None)
         self.fitting = Fitting(ground, self.weighing)
         view = View(scene, self.weighing.fine, self.weighing.thin, ground.signed, parameters.verify)

@@ -23,7 +23,6 @@ from scanfind.grid.moments import MomentGrid
 from scanfind.grid.scene import build_scene
 from scanfind.isolation.isolate import IsolateParameters, Placed, isolate
 from scanfind.isolation.own import IsolationParameters, isolation_gate
-from scanfind.library import joint_table
 from scanfind.library.near_surface import near_model
 from scanfind.pose import Pose
 from scanfind.priors.allowed import middle_of
@@ -32,7 +31,7 @@ from scanfind.recognition.ground import Ground
 from scanfind.recognition.recognise import Recognition
 from scanfind.recognition.sizes import Sizes
 from scanfind.recognition.weighing import Weighing
-from scanfind.scale.steps import sized, sizes_tried, with_pairs
+from scanfind.scale.steps import sized, sizes_tried
 from scanfind.search.hypotheses import Hypotheses, model_arrays
 
 if TYPE_CHECKING:
@@ -108,14 +107,12 @@ def seen_in(
 
     tried : sizes of the models, units of the scan a metre (K,)
     """
-    with clock("library"):
-        each = [(model, float(units)) for model in models for units in tried]
-        sizes = [with_pairs(sized(model, units)) for model, units in each]
-        table = joint_table(sizes, each_once=parameters.search.each_once)
+    each = [(model, float(units)) for model in models for units in tried]
+    sizes = [sized(model, units) for model, units in each]
     with clock("grid"):
         smallest = min(model.diameter for model in sizes)
         scene = build_scene(grid, smallest, parameters.grid, parameters.search.test_cells_across, jobs)
-    search, began = Recognition(scene, sizes, table, parameters, seed, jobs), clock.elapsed("search", "refine")
+    search, began = Recognition(scene, sizes, parameters, seed, jobs), clock.elapsed("search", "refine")
     while search.wants_more(clock.elapsed("search", "refine") - began):
         tell("search", search.progress(), 1.0)
         with clock("search"):

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanfind.cloud import OrientedCloud
-from scanfind.library.pairs import build_pairs
 from scanfind.symmetry import Symmetry
 
 if TYPE_CHECKING:
@@ -31,7 +30,7 @@ def sizes_tried(share: float) -> Floats:
 
 
 def sized(model: Model, units: float) -> Model:
-    """A model as a scan with so many units a metre shows it; with the pairs it has, see `with_pairs`."""
+    """A model as a scan with so many units a metre shows it."""
     samples = OrientedCloud(units * model.samples.points, model.samples.normals, model.samples.signed)
     return replace(
         model, diameter=units * model.diameter, spacing=units * model.spacing, area=units**2 * model.area,
@@ -39,8 +38,3 @@ def sized(model: Model, units: float) -> Model:
         cloud=None if model.cloud is None else replace(model.cloud, points=units * model.cloud.points),
         symmetry=Symmetry(units * model.symmetry.centre, model.symmetry.axes), similar=(),
     )  # fmt: skip
-
-
-def with_pairs(model: Model) -> Model:
-    """A sized model, ready for the search: models of all sizes are searched for by pairs at the same distances."""
-    return replace(model, pairs=build_pairs(model.samples, model.diameter, model.spacing, model.parameters.pairs))

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from scanfind.grid.air import Air
     from scanfind.grid.scene import OrientationGrid
     from scanfind.kernels.allowed import Allowed
-    from scanfind.library import JointTable
+    from scanfind.library.joint import JointTable
     from scanfind.library.pairs import PairParameters
     from scanfind.search.hypotheses import ModelArrays
 
@@ -95,7 +95,7 @@ class Draws:
         signs = np.repeat(np.arange(self.sides), len(first))
         first, second = np.tile(first, self.sides), np.tile(second, self.sides)
         keys, of = np.empty(len(first), np.int64), self.points
-        key_pairs(first, second, signs, of.points, of.normals, layout.angle_cell(), layout.angle_bins(), keys)
+        key_pairs(first, second, signs, of.points, of.normals, layout.edges, keys)
         pairs = Pairs(first, second, signs, keys).take(keys >= 0)
         return pairs._replace(keys=pairs.keys + rung * layout.cells_per_rung())
 

@@ -21,8 +21,8 @@ from scanfind.cloud import OrientedCloud
 from scanfind.grid.air import no_air
 from scanfind.grid.scene import orientation_grid
 from scanfind.grid.surfels import number
-from scanfind.library import joint_table
-from scanfind.library.pairs import build_pairs, rungs_of
+from scanfind.library.joint import joint_table
+from scanfind.library.pairs import rungs_of
 from scanfind.priors import Priors
 from scanfind.priors.allowed import NOTHING_KNOWN, allowed_poses
 from scanfind.search.draws import Draws, Trial, affordable, air_table, wald_table
@@ -123,7 +123,7 @@ class _Window:
         tolerance = max(scene.fine.cell, layout.tolerance * min(model.spacing for model in models))
         self._draws = Draws(self._lines, layout, rungs, tolerance, jobs)
         self._trial = Trial(
-            joint_table(as_lines), model_arrays(as_lines), marks, np.empty((0, 3)),
+            joint_table(as_lines, jobs=jobs), model_arrays(as_lines), marks, np.empty((0, 3)),
             scene.air if parameters.by_air else no_air(),
             wald_table(parameters.tests, SHOWN + (1.0 - SHOWN) * CHANCE, CHANCE), air_table(parameters.tests), 0.0,
             allowed_poses(models, priors, scene.fine.cells.offset), np.ones(len(models), np.bool_),
@@ -194,9 +194,7 @@ def level_of(model: Model, cell: float) -> int | None:
 
 def model_as_lines(model: Model, reach: float) -> Model:
     """A model of which samples and pairs are lines, in windows of radius `reach`, metres."""
-    lines = _lines(fitted_to(model, reach, LINES))
-    pairs = build_pairs(lines, model.diameter, model.spacing, model.parameters.pairs)
-    return replace(model, samples=lines, pairs=pairs, signed=False)
+    return replace(model, samples=_lines(fitted_to(model, reach, LINES)), signed=False)
 
 
 def fitted_to(model: Model, reach: float, most: int) -> Floats:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from scanfind.errors import require
 from scanfind.grid.air import no_air
-from scanfind.library.pairs import rungs_of
+from scanfind.library.joint import joint_table
+from scanfind.library.pairs import key_count, rungs_of
 from scanfind.priors import Priors
 from scanfind.priors.allowed import NOTHING_KNOWN, allowed_poses
 from scanfind.search.draws import Draws, Trial, affordable, air_table, wald_table
@@ -22,7 +23,7 @@ from scanfind.search.served import MOST_HYPOTHESES, Served, models_share
 
 if TYPE_CHECKING:
     from scanfind.grid.scene import Scene
-    from scanfind.library import JointTable
+    from scanfind.library.joint import JointTable
     from scanfind.library.model import Model
     from scanfind.search.hypotheses import ModelArrays
     from scanfind.search.served import Tally
@@ -115,12 +116,12 @@ class Search:
     """The rounds of RANSAC over one scene, for all models together; the same seed gives the same rounds."""
 
     def __init__(
-        self, scene: Scene, models: Sequence[Model], table: JointTable, arrays: ModelArrays,
+        self, scene: Scene, models: Sequence[Model], arrays: ModelArrays,
         parameters: SearchParameters, seed: int, jobs: int, learnt: Sequence[float] = (),
         priors: Priors = NOTHING_KNOWN,
     ) -> None:  # fmt: skip
         """Take a scene; learnt : of each model, the share of right pairs that found it elsewhere, 0: nobody knows."""
-        self.scene, self.models, self.table, self.arrays = scene, models, table, arrays
+        self.scene, self.models, self.arrays = scene, models, arrays
         self._allowed = allowed_poses(models, priors, scene.fine.cells.offset)
         self.parameters, self.seed, self.jobs = parameters, seed, jobs
         self.pairs = models[0].parameters.pairs
@@ -130,6 +131,9 @@ class Search:
         self._most_in_air = air_table(parameters.tests)
         # As far as two samples of a model may be off, but never less than the scene's own resampling.
         self._tolerance = max(scene.fine.cell, self.pairs.tolerance * min(model.spacing for model in models))
+        # Pairs are hashed of what is searched for: of most elements of a building, which stand in their places, never.
+        self._hashed = np.zeros(len(models), np.bool_)
+        self._table: JointTable | None = None
         self.choices = 0  # of surfels that were drawn from
         self.pool = Pool(scene, models, by_shape=parameters.by_shape, seed=seed, jobs=jobs)
         self._draws = self._draws_of_pool()
@@ -206,14 +210,14 @@ class Search:
 
         share : of a full round; sought : (models,) which are searched
         """
-        limits = self.parameters
+        limits, table = self.parameters, self._table_of(sought)
         count = round(share * limits.pairs_a_round / len(self.rungs))
         drawn = self._draws.draw(count, self.seed, self.choices, limits.max_tries)
         # Three of four choices of sides are wrong: as many more hypotheses are tested for the same right pairs.
         most = share * limits.hypotheses_a_round * self._draws.sides * models_share(int(sought.sum()))
-        tested = affordable(drawn, self.table.entries_of(sought), most, rarest_first=limits.telling_first)
+        tested = affordable(drawn, table.entries_of(sought), most, rarest_first=limits.telling_first)
         trial = Trial(
-            self.table,
+            table,
             self.arrays,
             self.scene.tolerant,
             self._origins,
@@ -224,25 +228,36 @@ class Search:
             self._allowed,
             sought,
         )
-        right = self._right_pairs(count, drawn.keys, tested.keys)
+        right = self._right_pairs(sought, count, drawn.keys, tested.keys)
         return trial.test(tested, self._draws.points, self.jobs), right
 
-    def _right_pairs(self, drawn_here: int, drawn: NDArray[np.int64], tested: NDArray[np.int64]) -> Floats:
-        """How many right pairs a round tested of an instance of each model that shows `overlap_ratio`, (models,).
+    def _table_of(self, sought: NDArray[np.bool_]) -> JointTable:
+        """The hash table of the models (models,) that are sought, and of those that were."""
+        if self._table is None or (sought & ~self._hashed).any():
+            self._hashed |= sought
+            self._table = joint_table(self.models, self._hashed, each_once=self.parameters.each_once, jobs=self.jobs)
+        return self._table
+
+    def _right_pairs(
+        self, sought: NDArray[np.bool_], drawn_here: int, drawn: NDArray[np.int64], tested: NDArray[np.int64]
+    ) -> Floats:
+        """How many right pairs a round tested of an instance that shows `overlap_ratio`, of each model that was sought,
+        (models,).
 
         drawn_here : pairs at each rung; drawn, tested : keys of those that met a second point, and of those tested
         """
-        cells, shown = len(self.table.offsets) - 1, self.parameters.overlap_ratio
+        cells, shown = key_count(self.pairs), self.parameters.overlap_ratio
         right = np.zeros(len(self.models))
         count = np.bincount(drawn, minlength=cells)
         # None of a feature that was not drawn was left out: without this a scan too small for a pair is never done.
         share = np.where(count > 0, np.bincount(tested, minlength=cells) / np.maximum(count, 1), 1.0)
-        for number, model in enumerate(self.models):
-            samples, rung_of_pair = len(model.samples), model.pairs.keys // self.pairs.cells_per_rung()
+        for number in np.flatnonzero(sought).tolist():
+            model = self.models[number]
+            samples, every, of_a_rung = len(model.samples), model.pairs.keys, self.pairs.cells_per_rung()
             on_it = shown * self.pool.on(number)
             first_on_it = min(1.0, on_it / max(len(self.pool), 1))
             for rung in rungs_of(model.diameter, model.parameters.pairs):
-                keys = model.pairs.keys[rung_of_pair == rung]
+                keys = every[slice(*np.searchsorted(every, [rung * of_a_rung, (rung + 1) * of_a_rung]))]
                 if not len(keys):
                     continue
                 # The share of its samples a pair's length away, as against all of the pool so far away.
