@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from scanfind.evidence.ends import FIXED, Slid, comes_near, slid, with_faces
-from scanfind.evidence.free_space import Limits, caster_of, spoken_by_each
+from scanfind.evidence.free_space import Limits, Towards, beams_to, caster_of, spoken_by_each
 from scanfind.grid.depth import Beams
 from scanfind.library.model import Model, ModelParameters, build_model
 from scanfind.library.surface import SurfaceParameters
@@ -77,20 +76,25 @@ def test_beams_that_end_before_it_say_nothing_and_are_not_asked(monkeypatch: pyt
     model, screen = bar(), blocks("screen", [((0.5, -0.8, -1.0), (1.5, -0.75, 1.5))])
     assert model.mesh is not None
     beams = seen_of([(model.mesh, at(0.05)), (screen, Pose.identity())])
-    kept: list[int] = []
+    asked: list[int] = []
 
-    def told(keep: Callable[..., NDArray[np.intp]]) -> Slid | None:
-        def counted(*given: Any) -> NDArray[np.intp]:
-            near = keep(*given)
-            kept.append(len(near))
-            return near
+    def told(allowed: float | None, near: Callable[..., NDArray[np.intp]]) -> Slid | None:
+        def counted(points: Floats, spacing: float, scanners: Sequence[Beams], *, short: float) -> Towards:
+            some = beams_to(points, spacing, scanners, short=short if allowed is None else allowed)
+            asked.append(len(some.ranges))
+            return some
 
-        monkeypatch.setattr("scanfind.evidence.ends.comes_near", counted)
+        monkeypatch.setattr("scanfind.evidence.ends.beams_to", counted)
+        monkeypatch.setattr("scanfind.evidence.ends.comes_near", near)
         return slid(model, caster_of(model), at(0.0), ALONG, 0.0, beams, LIMITS)
 
-    some, every = told(comes_near), told(lambda _, __, origins, *___: np.arange(len(origins)))
-    assert some == every is not None
-    assert 0 < kept[0] < 0.9 * kept[1]
+    def all_of_them(_: object, __: object, origins: Floats, *___: object) -> NDArray[np.intp]:
+        return np.arange(len(origins))
+
+    every = told(np.inf, all_of_them)
+    assert every is not None
+    assert told(np.inf, comes_near) == told(None, all_of_them) == told(None, comes_near) == every
+    assert 0 < asked[2] < 0.9 * asked[0]
 
 
 def test_faces_and_ends_are_weighed_where_they_agree_and_the_ends_believed_where_not() -> None:

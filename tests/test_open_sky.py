@@ -59,7 +59,7 @@ def test_a_scanner_is_silent_through_a_window_and_not_where_it_may_not_have_look
 
 def test_silence_reaches_as_far_as_the_scanner_sees() -> None:
     beams = tower(0.5)
-    silence = beams.silence()
+    silence = beams.silence
     assert silence.reach == pytest.approx(5.0, abs=0.01)
     every = np.arange(len(beams.nearest))
     everywhere = beams.origin + unpacked_beams(every, np.full(len(every), PIXELS_MIDDLE), beams.edge)[0]

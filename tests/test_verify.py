@@ -198,6 +198,21 @@ def test_what_beams_say_is_what_plain_rays_say(seed: int) -> None:
     assert sum(expected) > 0.0
 
 
+@pytest.mark.parametrize("short", [0.0, 0.05, 0.4, np.inf])
+def test_beams_that_fall_short_of_all_points_are_left_out_and_no_others(short: float) -> None:
+    beams, rng = beams_about(points_seen(), np.zeros(3)), np.random.default_rng(0)
+    points = np.array([2.0, 0.0, 0.0]) + rng.uniform(-1.0, 1.0, (60, 3))
+    expected = set[int]()
+    for point in points:
+        about = beams.towards(point[None], 0.1)
+        far = beams.beams_in(about)[1]
+        expected |= set(
+            about[far >= np.floor(max(0.0, float(np.linalg.norm(point)) - short) * RANGE_UNITS) / RANGE_UNITS]
+        )
+    assert set(beams.towards(points, 0.1, short)) == expected
+    assert short == np.inf or len(expected) < len(beams.towards(points, 0.1))
+
+
 def test_moving_everything_changes_nothing_a_beam_says() -> None:
     moved = Pose.from_rotation_vector(np.array([0.3, -1.0, 2.0]), np.array([10.0, -7.0, 3.0]))
     placed, limits = Pose(np.eye(3), np.array([2.1, 0.15, 0.1])), Limits(0.01, 0.05, 0.25)

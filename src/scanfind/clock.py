@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from scanfind.cloud import PointChunk
     from scanfind.progress import Progress
 
-# As results.json has them, with the total beside.
-STAGES = ("read", "library", "grid", "search", "verify", "refine", "isolate", "measure", "write")
+# As results.json has them, with the total beside; "place": what the design has, tried where it has it.
+STAGES = ("read", "library", "grid", "place", "search", "verify", "refine", "isolate", "measure", "write")
 
 
 class Clock:

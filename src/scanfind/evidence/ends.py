@@ -60,9 +60,10 @@ def slid(
     coarse = np.linspace(-REACH_M, REACH_M, COARSE)
     points = placed.move(model.samples.points)
     swept = np.concatenate([points + step * along for step in coarse[::5]])
-    beams, back = beams_to(swept, model.spacing, scanners), placed.inverse()
-    origins, directions, way = back.move(beams.origins), beams.directions @ placed.rotation, back.turn(along[None])[0]
     # Most beams of fifty rooms end before they are anywhere near: they say nothing, wherever it stands.
+    short = model.spacing + 2.5 * (coarse[1] - coarse[0]) + limits.inlier / limits.facing
+    beams, back = beams_to(swept, model.spacing, scanners, short=short), placed.inverse()
+    origins, directions, way = back.move(beams.origins), beams.directions @ placed.rotation, back.turn(along[None])[0]
     near = comes_near(model, REACH_M * way, origins, directions, beams.ranges + limits.inlier / limits.facing)
     beams, origins, directions = beams.take(near), origins[near], directions[near]
 

@@ -199,9 +199,14 @@ def towards(model: Model, placed: Pose, scanners: Sequence[Beams | Silence]) -> 
     return beams_to(placed.move(model.samples.points), model.spacing, scanners, MOST_BEAMS)
 
 
-def beams_to(points: Floats, spacing: float, scanners: Sequence[Beams | Silence], most: float = np.inf) -> Towards:
-    """The beams that go by points (N, 3) within their spacing, metres; `most` of them where there are more."""
-    pixels = [scanner.towards(points, REACH_SPACINGS * spacing) for scanner in scanners]
+def beams_to(
+    points: Floats, spacing: float, scanners: Sequence[Beams | Silence], most: float = np.inf, short: float = np.inf
+) -> Towards:
+    """The beams that go by points (N, 3) within their spacing, metres; `most` of them where there are more.
+
+    short : those that end more than so many metres before such a point are left out
+    """
+    pixels = [scanner.towards(points, REACH_SPACINGS * spacing, short) for scanner in scanners]
     share = min(1.0, most / max(sum(map(len, pixels)), 1))
     asked_for = [Towards(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, np.intp))]
     for number, (scanner, some) in enumerate(zip(scanners, pixels, strict=True)):

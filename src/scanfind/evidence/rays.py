@@ -50,6 +50,7 @@ class RayCaster:
         self._middle = np.round(0.5 * (corners.min(axis=0) + corners.max(axis=0)))
         self._scene: Any = EmbreeScene()
         self._mesh: Any = TriangleMesh(self._scene, (triangles - self._middle).astype(np.float32))
+        self.shoot(np.zeros(3), np.eye(3)[:1])  # Embree builds its tree at the first ray: not in two threads at once
 
     def shoot(self, origins: Floats, directions: Floats) -> Hits:
         """First hits of R rays: origins (R, 3) or (3,), unit directions (R, 3), scene frame, metres."""

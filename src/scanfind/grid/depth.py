@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-NO_BEAMS, NO_BITS = np.empty(0, np.int64), np.empty(0, np.uint8)
+NO_BEAMS, NO_BITS, NO_PATCHES = np.empty(0, np.int64), np.empty(0, np.uint8), np.empty(0, np.float32)
 
 DEPTH_PIXELS = 360  # along an edge of the cube map: 0.25° a pixel, 35 mm at 8 m
 # Pixels are joined until the maps speak of this share of what they look at: of the samples they are silent about, those
@@ -35,8 +35,8 @@ class Silence(NamedTuple):
     edge: int
     filled: float = 1.0  # each is one of its own
 
-    def towards(self, points: Floats, reach: float) -> NDArray[np.int64]:
-        """The pixels within `reach` metres of points (N, 3) from which nothing came back."""
+    def towards(self, points: Floats, reach: float, short: float = np.inf) -> NDArray[np.int64]:
+        """The pixels within `reach` metres of points (N, 3) from which nothing came back; none of these falls short."""
         return pixels_in(points, self.origin, reach, self.edge, silent=self.where)
 
     def beams_in(self, pixels: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
@@ -77,6 +77,7 @@ class Beams:
         turned |= np.roll(turned, 1) | np.roll(turned, -1)
         return np.asarray(~filled & turned[azimuth] & (elevation >= low) & (elevation <= high))
 
+    @cached_property
     def silence(self) -> Silence:
         """What the scanner did not see though it looked."""
         from scanfind.kernels.grid import NO_BEAM, RANGE_UNITS
@@ -85,13 +86,27 @@ class Beams:
         reach = float(np.quantile(ranges, SEES)) if len(ranges) else 0.0
         return Silence(self.origin, np.packbits(self.silent()), reach, self.edge)
 
-    def towards(self, points: Floats, reach: float) -> NDArray[np.int64]:
-        """The pixels within `reach` metres of points (N, 3) in which a beam came back."""
-        return pixels_in(points, self.origin, reach, self.edge, nearest=self.nearest)
+    def towards(self, points: Floats, reach: float, short: float = np.inf) -> NDArray[np.int64]:
+        """The pixels within `reach` metres of points (N, 3) in which a beam came back and ended no more than `short`
+        metres before the point.
+        """
+        return pixels_in(
+            points, self.origin, reach, self.edge, nearest=self.nearest, short=short, farthest=self._farthest
+        )
 
     def beams_in(self, pixels: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
         """Unit directions (B, 3), ranges and solid angles (B,) of the beams in some pixels (B,)."""
         return unpacked_beams(pixels, self.nearest[pixels], self.edge)
+
+    @cached_property
+    def _farthest(self) -> NDArray[np.float32]:
+        """How far any beam of each patch went, (6 · LOOKED_AT²,), metres; 0 where none came back."""
+        from scanfind.kernels.grid import NO_BEAM, RANGE_UNITS
+
+        few = self.edge // LOOKED_AT
+        ranges = np.where(self.nearest < NO_BEAM, (self.nearest >> 16) / RANGE_UNITS, 0.0).astype(np.float32)
+        patches = ranges.reshape(6, LOOKED_AT, few, LOOKED_AT, few).max(axis=(2, 4)).reshape(-1)
+        return np.asarray(np.nextafter(patches, np.float32(np.inf)))  # rounding shortens none
 
     @cached_property
     def filled(self) -> float:
@@ -154,13 +169,15 @@ def angles_of(edge: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
 
 def pixels_in(
     points: Floats, origin: Floats, reach: float, edge: int, *, nearest: NDArray[np.int64] = NO_BEAMS,
-    silent: NDArray[np.uint8] = NO_BITS,
+    silent: NDArray[np.uint8] = NO_BITS, short: float = np.inf, farthest: NDArray[np.float32] = NO_PATCHES,
 ) -> NDArray[np.int64]:  # fmt: skip
     """The pixels about a scanner within `reach` metres of points (N, 3) that have a beam, or a bit: see the kernel."""
     from scanfind.kernels.beams import pixels_towards
 
     met, found = np.zeros(6 * edge**2, np.bool_), np.empty(6 * edge**2, np.int64)
-    return found[: pixels_towards(points, origin, reach, edge, nearest, silent, met, found)]
+    across = max(1, edge // LOOKED_AT)
+    count = pixels_towards(points, origin, reach, edge, nearest, silent, short, farthest, across, met, found)
+    return found[:count]
 
 
 def unpacked_beams(pixels: NDArray[np.int64], beams: NDArray[np.int64], edge: int) -> tuple[Floats, Floats, Floats]:

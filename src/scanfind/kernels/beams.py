@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from math import sqrt
 
-from scanfind.kernels.grid import NO_BEAM, cube_place, unpack_beam
+import numpy as np
+
+from scanfind.kernels.grid import NO_BEAM, RANGE_UNITS, cube_place, unpack_beam
 from scanfind.kernels.jit import kernel
 
 
 @kernel
-def pixels_towards(points, origin, reach, edge, nearest, silent, met, pixels):
+def pixels_towards(points, origin, reach, edge, nearest, silent, short, farthest, across, met, pixels):
     """The pixels within `reach` metres of points (N, 3) in which a scanner has a beam; returns how many.
 
     nearest : (6·edge²,) the scanner's beams (kernels.grid.pack_beam); where it is empty, silent : (6·edge²/8,) uint8, a
         bit for each pixel that counts
+    short : beams that end more than so many metres before the point are left out …
+    farthest : … and how far any of a patch goes, (6·(edge/across)²,) float32, spares most of the looking
     met : (6·edge²,) all False
     pixels : out, the first so many of at most 6·edge²
     """
@@ -23,20 +27,52 @@ def pixels_towards(points, origin, reach, edge, nearest, silent, met, pixels):
         if dx == 0.0 and dy == 0.0 and dz == 0.0:
             continue
         face, u, v = cube_place(dx, dy, dz)
+        distance = sqrt(dx * dx + dy * dy + dz * dz)
         # A metre across the line of sight is so much on the face, which is closest in its middle.
-        wide = reach / sqrt(dx * dx + dy * dy + dz * dz) * (1.0 + u * u + v * v)
-        low_u, high_u = int((u - wide + 1.0) * 0.5 * edge), int((u + wide + 1.0) * 0.5 * edge)
-        low_v, high_v = int((v - wide + 1.0) * 0.5 * edge), int((v + wide + 1.0) * 0.5 * edge)
-        for iu in range(max(0, low_u), min(edge - 1, high_u) + 1):
-            for iv in range(max(0, low_v), min(edge - 1, high_v) + 1):
+        wide = reach / distance * (1.0 + u * u + v * v)
+        low_u, high_u = max(0, int((u - wide + 1.0) * 0.5 * edge)), min(edge - 1, int((u + wide + 1.0) * 0.5 * edge))
+        low_v, high_v = max(0, int((v - wide + 1.0) * 0.5 * edge)), min(edge - 1, int((v + wide + 1.0) * 0.5 * edge))
+        least = distance - short
+        if (
+            least > 0.0
+            and len(farthest)
+            and not _any_beyond(
+                least,
+                farthest,
+                edge // across,
+                face,
+                low_u // across,
+                high_u // across,
+                low_v // across,
+                high_v // across,
+            )
+        ):
+            continue
+        shortest = np.int64(max(least, 0.0) * RANGE_UNITS) << 16
+        for iu in range(low_u, high_u + 1):
+            for iv in range(low_v, high_v + 1):
                 pixel = (face * edge + iu) * edge + iv
                 if met[pixel]:
                     continue
-                if nearest[pixel] < NO_BEAM if len(nearest) else silent[pixel >> 3] >> (7 - (pixel & 7)) & 1:
+                if (
+                    shortest <= nearest[pixel] < NO_BEAM
+                    if len(nearest)
+                    else silent[pixel >> 3] >> (7 - (pixel & 7)) & 1
+                ):
                     met[pixel] = True
                     pixels[count] = pixel
                     count += 1
     return count
+
+
+@kernel
+def _any_beyond(least, farthest, edge, face, low_u, high_u, low_v, high_v):
+    """Does any beam of some patches of a face go so far?"""
+    for iu in range(low_u, high_u + 1):
+        for iv in range(low_v, high_v + 1):
+            if farthest[(face * edge + iu) * edge + iv] >= least:
+                return True
+    return False
 
 
 @kernel

@@ -6,8 +6,8 @@ One pass over the points serves all of them: the cells of the smallest, summed t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from scanfind.grid.scene import first_cell
 from scanfind.library.near_surface import near_model
 from scanfind.recognition.candidate import Standing
 from scanfind.recognition.stands import as_found
+from scanfind.threads import in_threads
 
 if TYPE_CHECKING:
     from scanfind.design.elements import Element
@@ -24,8 +25,10 @@ if TYPE_CHECKING:
     from scanfind.library.model import Model
     from scanfind.parameters import Parameters
     from scanfind.recognition.recognise import Recognition
+    from scanfind.recognition.witnesses import Witnesses
 
 Floats = NDArray[np.float64]
+Told = TypeVar("Told")
 
 # Models within two octaves are searched together: what draws, tests and depth maps cost once is then shared.
 SPAN = 4.0
@@ -135,19 +138,36 @@ class Sizes:
         by_ends = {one.id: one for one in detections}
         asked = [(search.models, search.weighing.witnesses) for search in self.all]
         if at_design:
-            for models, witnesses in asked:
-                for model in models:
-                    by_ends |= witnesses.with_ends(model, detections)
+            for each in self._each(asked, lambda model, witnesses: witnesses.with_ends(model, detections)):
+                by_ends |= each
             stand = as_found(self._models, detections)
             asked = [(models, witnesses.among(stand)) for models, witnesses in asked]
-        every = {model.name: (model, witnesses) for models, witnesses in asked for model in models}
         found = list(by_ends.values())
         if len(stations) > 1:
-            whose = [(one, *every[one.model]) for one in found]
-            found = [witnesses.with_stations(model, one, stations) for one, model, witnesses in whose]
+            of_model = {model.name: [one for one in found if one.model == model.name] for model in self._models}
+            told = self._each(
+                asked,
+                lambda model, witnesses: [
+                    witnesses.with_stations(model, one, stations) for one in of_model[model.name]
+                ],
+            )
+            by_id = {one.id: one for some in told for one in some}
+            found = [by_id[one.id] for one in found]
         if at_design:
-            elements = {name: witnesses.elements(model, found, stations) for name, (model, witnesses) in every.items()}
+            told_of = self._each(asked, lambda model, witnesses: witnesses.elements(model, found, stations))
+            names = [model.name for models, _ in asked for model in models]
+            elements = dict(zip(names, told_of, strict=True))
         return found, [element for model in self._models for element in elements.get(model.name, ())]
+
+    def _each(
+        self, asked: Sequence[tuple[Sequence[Model], Witnesses]], ask: Callable[[Model, Witnesses], Told]
+    ) -> list[Told]:
+        """What the witnesses of each size say of each of its models, in order; models are asked for side by side."""
+        whose = [(model, witnesses) for models, witnesses in asked for model in models]
+        pieces = in_threads(
+            self.all[0].ground.jobs, len(whose), lambda start, stop: [ask(*each) for each in whose[start:stop]]
+        )
+        return [each for piece in pieces for each in piece]
 
     def noise(self) -> float:
         """Spread of the raw points about the largest parts found, metres."""

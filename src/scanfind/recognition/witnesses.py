@@ -20,7 +20,7 @@ from scanfind.pose import Pose
 if TYPE_CHECKING:
     from scanfind.evidence.neighbours import Design
     from scanfind.evidence.rays import RayCaster
-    from scanfind.grid.depth import Beams, Silence
+    from scanfind.grid.depth import Beams
     from scanfind.kernels.distance import NearSurface
     from scanfind.library.model import Model
 
@@ -48,7 +48,6 @@ class Witnesses:
     limits: Limits
     design: Design | None
     _casters: dict[str, RayCaster] = field(default_factory=dict, init=False)
-    _silences: list[Silence] = field(default_factory=list, init=False)
 
     def say_by_each(self, model: Model, placed: Pose, *, in_place: bool = False, instead_of: str = "") -> Floats:
         """What each says of a model at a pose relative to the grid's offset, rows as of Spoken, (S, 4), m².
@@ -69,7 +68,8 @@ class Witnesses:
         surface : of the model; as far as it reaches beams are asked for
         Returns (N, 3) relative to the grid's offset, and of how much, (N,) m²: less than it is where they graze it.
         """
-        beams = beams_to(placed.move(model.samples.points), surface.reach + model.spacing, self.beams, MOST_ABOUT)
+        reach = surface.reach + model.spacing
+        beams = beams_to(placed.move(model.samples.points), reach, self.beams, MOST_ABOUT, short=reach)
         ends, areas = beams.ends(), beams.angles * beams.ranges**2
         about = np.flatnonzero(measured(surface, placed, ends, 1)[1] >= 0)
         if self.design is not None:
@@ -93,7 +93,6 @@ class Witnesses:
         """The same scanners, where elements stand as in another design."""
         told = replace(self, design=design)
         told._casters.update(self._casters)
-        told._silences.extend(self._silences)
         return told
 
     def say_of_place(self, model: Model, pose: Pose, is_there: bool) -> Floats:
@@ -111,10 +110,9 @@ class Witnesses:
 
         said : (S, 4) of the beams that did, as of `say_at`: so many are silent on any surface, and are left out
         """
-        if not self._silences:
-            self._silences.extend(each.silence() for each in self.beams)
         caster, placed, found = self._caster(model), self._in_grid(pose), []
-        for beams, silence, came in zip(self.beams, self._silences, said.sum(axis=1), strict=True):
+        for beams, came in zip(self.beams, said.sum(axis=1), strict=True):
+            silence = beams.silence
             through = spoken_of(model, caster, placed, [silence], self.limits).through if silence.where.any() else 0.0
             found.append(max(0.0, through - came * (1.0 - beams.filled)))
         return np.array(found)
