@@ -30,10 +30,10 @@ def seen_of(placed: Sequence[tuple[Mesh, Pose]]) -> list[Beams]:
             zip(scan(scene, scanner=Scanner(step=0.004), seed=1).stations, STATIONS, strict=True)]  # fmt: skip
 
 
-def beams_about(points: Floats, origin: Floats) -> Beams:
+def beams_about(points: Floats, origin: Floats, edge: int = 360) -> Beams:
     """What a scanner would keep of points it saw, (N, 3)."""
-    nearest = np.full(6 * 360**2, NO_BEAM)
+    nearest = np.full(6 * edge**2, NO_BEAM)
     for way in points - origin:
-        pixel, packed = pack_beam(*cube_place(*way), 360, float(np.linalg.norm(way)))
+        pixel, packed = pack_beam(*cube_place(*way), edge, float(np.linalg.norm(way)))
         nearest[pixel] = min(nearest[pixel], packed)
-    return Beams(origin, nearest, 360)
+    return Beams(origin, nearest, edge)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scanfind.evidence.ends import FIXED, Slid, comes_near, slid, with_faces
 from scanfind.evidence.free_space import Limits, Towards, beams_to, caster_of, spoken_by_each
 from scanfind.grid.depth import Beams
-from scanfind.library.model import Model, ModelParameters, build_model
+from scanfind.library.model import Cover, Model, ModelParameters, build_model
 from scanfind.library.surface import SurfaceParameters
 from scanfind.pose import Pose
 from scanfind.recognition.stands import as_designed
@@ -79,8 +79,8 @@ def test_beams_that_end_before_it_say_nothing_and_are_not_asked(monkeypatch: pyt
     asked: list[int] = []
 
     def told(allowed: float | None, near: Callable[..., NDArray[np.intp]]) -> Slid | None:
-        def counted(points: Floats, spacing: float, scanners: Sequence[Beams], *, short: float) -> Towards:
-            some = beams_to(points, spacing, scanners, short=short if allowed is None else allowed)
+        def counted(covers: Sequence[Cover], scanners: Sequence[Beams], *, short: float) -> Towards:
+            some = beams_to(covers, scanners, short=short if allowed is None else allowed)
             asked.append(len(some.ranges))
             return some
 

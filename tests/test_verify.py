@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 import naive
 from scanfind.cloud import CloudModel, PointChunk
-from scanfind.evidence.free_space import Limits, Spoken, caster_of, spoken_by_each, spoken_of
+from scanfind.evidence.free_space import Limits, Spoken, beams_to, caster_of, covers_of, spoken_by_each, spoken_of
 from scanfind.evidence.verify import distinct, gather_support, spread
 from scanfind.fit.refine import Refined
 from scanfind.grid.depth import LEAST_FILLED, LEAST_SPOKEN, Beams, DepthMap, joined_until_spoken
 from scanfind.grid.moments import MomentGrid
 from scanfind.grid.scene import GridParameters, Scene, build_scene
+from scanfind.kernels.beams import SHORT_STEP_M
 from scanfind.kernels.grid import AIM_UNITS, NO_BEAM, RANGE_UNITS, cube_pixel, cube_place, pack_beam, unpack_beam
 from scanfind.library.model import Model, ModelParameters, build_model
 from scanfind.library.surface import SurfaceParameters
@@ -199,18 +200,39 @@ def test_what_beams_say_is_what_plain_rays_say(seed: int) -> None:
 
 
 @pytest.mark.parametrize("short", [0.0, 0.05, 0.4, np.inf])
-def test_beams_that_fall_short_of_all_points_are_left_out_and_no_others(short: float) -> None:
+@pytest.mark.parametrize("reach", [0.02, 0.1])  # less and more than a block of pixels
+def test_beams_that_fall_short_of_all_points_are_left_out_and_no_others(short: float, reach: float) -> None:
     beams, rng = beams_about(points_seen(), np.zeros(3)), np.random.default_rng(0)
     points = np.array([2.0, 0.0, 0.0]) + rng.uniform(-1.0, 1.0, (60, 3))
-    expected = set[int]()
+    needed, allowed = set[int](), set[int]()
     for point in points:
-        about = beams.towards(point[None], 0.1)
-        far = beams.beams_in(about)[1]
-        expected |= set(
-            about[far >= np.floor(max(0.0, float(np.linalg.norm(point)) - short) * RANGE_UNITS) / RANGE_UNITS]
-        )
-    assert set(beams.towards(points, 0.1, short)) == expected
-    assert short == np.inf or len(expected) < len(beams.towards(points, 0.1))
+        about, farther = beams.towards(point[None], reach), beams.towards(point[None], reach + 0.1)
+        least = max(0.0, float(np.linalg.norm(point)) - short - 1e-3)
+        needed |= set(about[beams.beams_in(about)[1] > least + 2e-3])
+        allowed |= set(farther[beams.beams_in(farther)[1] > least - SHORT_STEP_M])
+    found = set(beams.towards(points, reach, short))
+    assert needed <= found <= allowed
+    assert short == np.inf or len(found) < len(beams.towards(points, reach))
+
+
+@pytest.mark.parametrize("edge", [45, 360, 1800])
+def test_few_samples_or_many_every_beam_that_meets_a_model_is_asked(edge: int) -> None:
+    points = np.random.default_rng(0).normal(size=(20_000, 3)) * [1.0, 0.3, 0.3] + [6.0, 0.0, 0.0]
+    beams, placed = (
+        beams_about(points, np.zeros(3), edge),
+        Pose(random_rotation(np.random.default_rng(1)), np.array([3.0, 0.0, 0.0])),
+    )
+    covers = covers_of(box(), placed)
+    assert [len(cover.points) for cover in covers] == [600, 75]
+    pixels = np.flatnonzero(beams.nearest < NO_BEAM)
+    back = placed.inverse()
+    hits = caster_of(box()).shoot(back.move(np.zeros((1, 3)))[0], beams.beams_in(pixels)[0] @ placed.rotation)
+    meeting = set(pixels[np.isfinite(hits.distance)])
+    assert len(meeting) > 10
+    for cover in covers:
+        assert meeting <= set(beams.towards(*cover))
+    asked = len(beams_to(covers, [beams]).ranges)
+    assert min(len(beams.towards(*cover)) for cover in covers) <= asked <= len(beams.towards(*covers[-1]))
 
 
 def test_moving_everything_changes_nothing_a_beam_says() -> None:

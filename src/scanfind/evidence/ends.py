@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanfind.evidence.free_space import Limits, beams_to
+from scanfind.evidence.free_space import Limits, beams_to, covers_of
 from scanfind.pose import Pose
 
 if TYPE_CHECKING:
@@ -58,11 +58,10 @@ def slid(
     if design is not None and abs(design) >= REACH_M:
         return None
     coarse = np.linspace(-REACH_M, REACH_M, COARSE)
-    points = placed.move(model.samples.points)
-    swept = np.concatenate([points + step * along for step in coarse[::5]])
+    swept = covers_of(model, placed, swept=coarse[::5, None] * along)
     # Most beams of fifty rooms end before they are anywhere near: they say nothing, wherever it stands.
-    short = model.spacing + 2.5 * (coarse[1] - coarse[0]) + limits.inlier / limits.facing
-    beams, back = beams_to(swept, model.spacing, scanners, short=short), placed.inverse()
+    short = 2.5 * (coarse[1] - coarse[0]) + limits.inlier / limits.facing
+    beams, back = beams_to(swept, scanners, short=short), placed.inverse()
     origins, directions, way = back.move(beams.origins), beams.directions @ placed.rotation, back.turn(along[None])[0]
     near = comes_near(model, REACH_M * way, origins, directions, beams.ranges + limits.inlier / limits.facing)
     beams, origins, directions = beams.take(near), origins[near], directions[near]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from scanfind.evidence.rays import RayCaster
 from scanfind.grid.depth import LEAST_FILLED
+from scanfind.library.model import Cover
 from scanfind.mesh import Mesh
 from scanfind.pose import Pose
 
@@ -23,14 +24,15 @@ if TYPE_CHECKING:
     from scanfind.library.model import Model
 
 Floats = NDArray[np.float64]
+STAYS = np.zeros((1, 3))
 
 # What a beam says of a surface it would have met: see Spoken; a beam a hair within the outline says nothing.
 ON, BESIDE, THROUGH, HIDDEN, NOTHING = range(5)
 
 # Beams asked of a pose: a share of them is then known within a half per cent.
 MOST_BEAMS = 6000
-# Pixels this many sample spacings about each sample cover a model: no point of it is farther from one than 1.
-REACH_SPACINGS = 1.0
+# A model's samples are more than a scanner needs where they are nearer to each other than so many pixels.
+WIDE_PIXELS = 2.0
 # Where a beam ended on a surface and on another element as well it speaks for the surface only if that is so much
 # nearer, in inliers; and faces that lie on each other are no farther apart than so.
 TELLS_APART, FLUSH_M = 0.25, 5e-4
@@ -194,19 +196,38 @@ class Towards(NamedTuple):
         return self.origins + self.directions * self.ranges[:, None]
 
 
-def towards(model: Model, placed: Pose, scanners: Sequence[Beams | Silence]) -> Towards:
-    """The beams that go towards a placed model, MOST_BEAMS of them where there are more."""
-    return beams_to(placed.move(model.samples.points), model.spacing, scanners, MOST_BEAMS)
+def towards(model: Model, placed: Pose, scanners: Sequence[Beams | Silence], short: float = np.inf) -> Towards:
+    """The beams that go towards a placed model, MOST_BEAMS of them where there are more; short : see `beams_to`."""
+    return beams_to(covers_of(model, placed), scanners, MOST_BEAMS, short)
+
+
+def covers_of(model: Model, placed: Pose, more: float = 0.0, swept: Floats = STAYS) -> list[Cover]:
+    """What covers a placed model, with fewer and fewer points, in the frame of the pose.
+
+    more : metres about it that are to be covered as well; swept : (K, 3) shifts in each of which it is
+    """
+    return [
+        Cover((placed.move(points) + swept[:, None]).reshape(-1, 3), reach + more) for points, reach in model.covers
+    ]
 
 
 def beams_to(
-    points: Floats, spacing: float, scanners: Sequence[Beams | Silence], most: float = np.inf, short: float = np.inf
+    covers: Sequence[Cover], scanners: Sequence[Beams | Silence], most: float = np.inf, short: float = np.inf
 ) -> Towards:
-    """The beams that go by points (N, 3) within their spacing, metres; `most` of them where there are more.
+    """The beams that go by what is covered, at a little more than the reach of the covers at most; `most` of them where
+    there are more.
 
-    short : those that end more than so many metres before such a point are left out
+    covers : of one and the same, with fewer and fewer points
+    short : most of those that end more than so many metres before it are left out
     """
-    pixels = [scanner.towards(points, REACH_SPACINGS * spacing, short) for scanner in scanners]
+    pixels = []
+    for scanner in scanners:
+        points, reach = covers[0]
+        away = float(np.linalg.norm(covers[-1].points - scanner.origin, axis=1).min(initial=np.inf)) - covers[-1].reach
+        for fewer in covers[1:]:
+            if fewer.reach <= WIDE_PIXELS * 2.0 / scanner.edge * away:
+                points, reach = fewer
+        pixels.append(scanner.towards(points, reach, short + reach))
     share = min(1.0, most / max(sum(map(len, pixels)), 1))
     asked_for = [Towards(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, np.intp))]
     for number, (scanner, some) in enumerate(zip(scanners, pixels, strict=True)):

@@ -36,7 +36,7 @@ class Silence(NamedTuple):
     filled: float = 1.0  # each is one of its own
 
     def towards(self, points: Floats, reach: float, short: float = np.inf) -> NDArray[np.int64]:
-        """The pixels within `reach` metres of points (N, 3) from which nothing came back; none of these falls short."""
+        """The pixels within `reach` metres of points (N, 3) from which nothing came back: none is too short."""
         return pixels_in(points, self.origin, reach, self.edge, silent=self.where)
 
     def beams_in(self, pixels: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
@@ -172,11 +172,12 @@ def pixels_in(
     silent: NDArray[np.uint8] = NO_BITS, short: float = np.inf, farthest: NDArray[np.float32] = NO_PATCHES,
 ) -> NDArray[np.int64]:  # fmt: skip
     """The pixels about a scanner within `reach` metres of points (N, 3) that have a beam, or a bit: see the kernel."""
-    from scanfind.kernels.beams import pixels_towards
+    from scanfind.kernels.beams import BLOCK, NOT_ASKED, pixels_towards
 
     met, found = np.zeros(6 * edge**2, np.bool_), np.empty(6 * edge**2, np.int64)
     across = max(1, edge // LOOKED_AT)
-    count = pixels_towards(points, origin, reach, edge, nearest, silent, short, farthest, across, met, found)
+    asked = np.full(6 * (-(-edge // BLOCK)) ** 2, NOT_ASKED, np.int32)
+    count = pixels_towards(points, origin, reach, edge, nearest, silent, short, farthest, across, asked, met, found)
     return found[:count]
 
 

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scanfind.cloud import CloudModel, OrientedCloud
 from scanfind.library.cloud_surface import sample_cloud
@@ -22,6 +23,8 @@ from scanfind.symmetry import Symmetry, parse_axes
 
 # Part of every model's hash: raise it when the samples or pairs of one and the same model come out differently.
 RECIPE = "scanfind model, recipe 1"
+
+FEWER, LEAST_COVER = 8, 40  # from one cover to the next so many times fewer samples, but never fewer than so many
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,13 @@ class ModelParameters:
 
 
 DEFAULTS = ModelParameters()
+
+
+class Cover(NamedTuple):
+    """Points (N, 3) of a surface of which none is farther from them than a reach; metres."""
+
+    points: NDArray[np.float64]
+    reach: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +94,17 @@ class Model:
     def pair_count(self) -> int:
         """How many pairs there are, whether or not anybody has asked for them."""
         return pair_count(self.samples, self.diameter, self.spacing, self.parameters.pairs)
+
+    @cached_property
+    def covers(self) -> tuple[Cover, ...]:
+        """The samples, model frame, and ever fewer of them: from far away few show as much."""
+        from scanfind.kernels.sampling import farthest_from_first
+
+        points, covers = self.samples.points, [Cover(self.samples.points, self.spacing)]
+        while len(covers[-1].points) >= FEWER * LEAST_COVER:
+            some = points[: len(covers[-1].points) // FEWER]
+            covers.append(Cover(some, self.spacing + float(farthest_from_first(points, len(some)))))
+        return tuple(covers)
 
     def area_of_a_sample(self) -> float:
         """The surface a sample stands for, m²."""

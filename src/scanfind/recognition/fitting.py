@@ -111,7 +111,7 @@ class Fitting:
         """A pose of a model fitted to where beams ended."""
         ground, near = self._ground, self.near(number)
         for _ in range(ON_BEAMS_STEPS):
-            ends = towards(ground.models[number], pose, ground.scene.beams).ends()
+            ends = towards(ground.models[number], pose, ground.scene.beams, near.reach).ends()
             fitted = polish(near, pose, ends, np.zeros(len(ends), np.int64), ground.parameters.refine)
             pose = fitted.scene_from_model if fitted else pose
         return pose

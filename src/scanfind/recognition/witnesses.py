@@ -12,7 +12,17 @@ from numpy.typing import NDArray
 from scanfind.design.elements import Element, assigned, elements_of, open_slide, placements_of, said_by
 from scanfind.detection import Detection, Motion
 from scanfind.evidence.ends import Slid, slid, with_faces
-from scanfind.evidence.free_space import ON, THROUGH, Limits, beams_to, caster_of, spoken_by_each, spoken_of, verdicts
+from scanfind.evidence.free_space import (
+    ON,
+    THROUGH,
+    Limits,
+    beams_to,
+    caster_of,
+    covers_of,
+    spoken_by_each,
+    spoken_of,
+    verdicts,
+)  # fmt: skip
 from scanfind.fit.patches import measured
 from scanfind.fit.refine import triple
 from scanfind.pose import Pose
@@ -68,14 +78,14 @@ class Witnesses:
         surface : of the model; as far as it reaches beams are asked for
         Returns (N, 3) relative to the grid's offset, and of how much, (N,) m²: less than it is where they graze it.
         """
-        reach = surface.reach + model.spacing
-        beams = beams_to(placed.move(model.samples.points), reach, self.beams, MOST_ABOUT, short=reach)
+        about = covers_of(model, placed, more=surface.reach)
+        beams = beams_to(about, self.beams, MOST_ABOUT, short=surface.reach)
         ends, areas = beams.ends(), beams.angles * beams.ranges**2
-        about = np.flatnonzero(measured(surface, placed, ends, 1)[1] >= 0)
+        near = np.flatnonzero(measured(surface, placed, ends, 1)[1] >= 0)
         if self.design is not None:
             within = NEIGHBOUR_INLIERS * self.limits.inlier
-            about = about[np.isinf(self.design.off({model.name}, ends[about] + self.offset, within))]
-        return ends[about], areas[about]
+            near = near[np.isinf(self.design.off({model.name}, ends[near] + self.offset, within))]
+        return ends[near], areas[near]
 
     def _asks(
         self, model: Model, placed: Pose, *, in_place: bool
