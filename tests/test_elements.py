@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,14 +30,16 @@ from scanfind.design.elements import (
 )
 from scanfind.detection import Detection
 from scanfind.evidence.free_space import Spoken
-from scanfind.fit.refine import held
+from scanfind.fit.refine import Refined, held
 from scanfind.library import ModelLibrary
 from scanfind.library.model import ModelParameters, build_model
 from scanfind.library.surface import SurfaceParameters
 from scanfind.mesh import Mesh, Placement
 from scanfind.pose import Pose, random_rotation, rotation_from_vector, rotation_vector
+from scanfind.recognition.in_place import InPlace
 from scanfind.recognition.sizes import SPAN, by_size
 from scanfind.results import MODELS, read_results
+from scanfind.search.hypotheses import Hypotheses
 from scanfind.simulate.parts import blocks, box, cylinder
 from scanfind.simulate.scanner import Scanner, scan
 from scanfind.simulate.scene import Scene, SceneObject
@@ -202,6 +205,29 @@ def test_every_element_has_the_status_it_should(inspected: scanfind.Findings) ->
     assert [element.status for element in inspected.elements] == [INSTALLED, INSTALLED, NOT_FOUND, OCCLUDED]
     assert [element.placement.global_id for element in inspected.elements] == ["gid0", "gid1", "gid2", "gid3"]
     assert len(inspected) == 2
+
+
+def test_however_long_places_take_what_is_elsewhere_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    built = (
+        SceneObject("floor", FLOOR, Pose.identity()),
+        SceneObject("as designed", BRACKET, at(-2, 0), target=True),
+        SceneObject("elsewhere", BRACKET, at(1.0, 1.5, 0.0, 0.7), target=True),
+    )
+    stood = np.array([[0.3, -3.5, 1.5], [-3.5, 2.5, 1.5]])
+    stations = scan(Scene(built, stood), scanner=Scanner(step=0.0015), seed=3).stations
+    default, refine, limit = scanfind.PRESETS["default"], InPlace.refine, 1.0
+
+    def slowly(self: InPlace, hypotheses: Hypotheses) -> Refined:
+        time.sleep(1.1 * limit)
+        return refine(self, hypotheses)
+
+    monkeypatch.setattr(InPlace, "refine", slowly)
+    short = replace(default, search=replace(default.search, time_limit_s=limit))
+    found = scanfind.find(stations, placed(BRACKET, at(-2, 0), at(2, 0)), at_design=True, parameters=short)
+    assert len(found) == 2
+    assert found.timings_s["place"] > limit
+    elsewhere = at(1.0, 1.5, 0.0, 0.7)
+    assert min(one.scene_from_model.difference(elsewhere)[0] for one in found) < 0.005
 
 
 def test_what_each_station_says_adds_up_to_what_all_say(inspected: scanfind.Findings) -> None:

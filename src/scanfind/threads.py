@@ -6,8 +6,9 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import TypeVar
+from typing import Generic, TypeVar
 
+Owner = TypeVar("Owner")
 Result = TypeVar("Result")
 
 # Pieces a thread: a few, so that one slow piece does not leave the others waiting.
@@ -47,6 +48,22 @@ def _threads(jobs: int) -> ThreadPoolExecutor:
 
 if hasattr(os, "register_at_fork"):  # threads do not come along into a child process
     os.register_at_fork(after_in_child=_threads.cache_clear)
+
+
+class once(Generic[Owner, Result]):  # noqa: N801  it is used as `property` is
+    """What is computed when first asked for: `functools.cached_property`, which before Python 3.12 computes for one
+    instance of a class at a time, whatever the threads. Two that ask for the same at once may both compute it.
+    """
+
+    def __init__(self, compute: Callable[[Owner], Result]) -> None:
+        self._compute, self.__doc__ = compute, compute.__doc__
+
+    def __set_name__(self, owner: type[Owner], name: str) -> None:
+        self._name = name
+
+    def __get__(self, instance: Owner, owner: type[Owner]) -> Result:
+        result = instance.__dict__[self._name] = self._compute(instance)  # where Python looks first
+        return result
 
 
 def available_cores() -> int:

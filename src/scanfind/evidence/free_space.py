@@ -231,6 +231,8 @@ def beams_to(
     share = min(1.0, most / max(sum(map(len, pixels)), 1))
     asked_for = [Towards(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, np.intp))]
     for number, (scanner, some) in enumerate(zip(scanners, pixels, strict=True)):
+        if not len(some):
+            continue  # most of fifty rooms
         directions, ranges, angles = scanner.beams_in(some[lots(some) < share])
         # Each of those asked stands for those left out, and for those between it and the next that were never sent.
         of_all = share * max(scanner.filled, LEAST_FILLED)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from scanfind.threads import once
 
 Floats = NDArray[np.float64]
 NO_BEAMS, NO_BITS, NO_PATCHES = np.empty(0, np.int64), np.empty(0, np.uint8), np.empty(0, np.float32)
@@ -77,7 +79,7 @@ class Beams:
         turned |= np.roll(turned, 1) | np.roll(turned, -1)
         return np.asarray(~filled & turned[azimuth] & (elevation >= low) & (elevation <= high))
 
-    @cached_property
+    @once
     def silence(self) -> Silence:
         """What the scanner did not see though it looked."""
         from scanfind.kernels.grid import NO_BEAM, RANGE_UNITS
@@ -98,7 +100,7 @@ class Beams:
         """Unit directions (B, 3), ranges and solid angles (B,) of the beams in some pixels (B,)."""
         return unpacked_beams(pixels, self.nearest[pixels], self.edge)
 
-    @cached_property
+    @once
     def _farthest(self) -> NDArray[np.float32]:
         """How far any beam of each patch went, (6 · LOOKED_AT²,), metres; 0 where none came back."""
         from scanfind.kernels.grid import NO_BEAM, RANGE_UNITS
@@ -108,7 +110,7 @@ class Beams:
         patches = ranges.reshape(6, LOOKED_AT, few, LOOKED_AT, few).max(axis=(2, 4)).reshape(-1)
         return np.asarray(np.nextafter(patches, np.float32(np.inf)))  # rounding shortens none
 
-    @cached_property
+    @once
     def filled(self) -> float:
         """The share of directions towards a surface that brought a beam back: of patches, that of the upper quarter."""
         from scanfind.kernels.grid import NO_BEAM

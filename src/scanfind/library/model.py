@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +19,7 @@ from scanfind.library.surface import SurfaceParameters, sample_mesh
 from scanfind.library.symmetries import declared_symmetry, find_symmetry
 from scanfind.mesh import Mesh, Placement
 from scanfind.symmetry import Symmetry, parse_axes
+from scanfind.threads import once
 
 # Part of every model's hash: raise it when the samples or pairs of one and the same model come out differently.
 RECIPE = "scanfind model, recipe 1"
@@ -85,17 +85,17 @@ class Model:
     placements: tuple[Placement, ...]
     parameters: ModelParameters
 
-    @cached_property
+    @once
     def pairs(self) -> PairTable:
         """The oriented pairs of the samples with their keys: made when a search first asks for them (decision 35)."""
         return build_pairs(self.samples, self.diameter, self.spacing, self.parameters.pairs)
 
-    @cached_property
+    @once
     def pair_count(self) -> int:
         """How many pairs there are, whether or not anybody has asked for them."""
         return pair_count(self.samples, self.diameter, self.spacing, self.parameters.pairs)
 
-    @cached_property
+    @once
     def covers(self) -> tuple[Cover, ...]:
         """The samples, model frame, and ever fewer of them: from far away few show as much."""
         from scanfind.kernels.sampling import farthest_from_first

@@ -54,7 +54,8 @@ class SearchParameters:
     facing_only : … of those that face a scanner position, where all are known: a chunky part seen from one side shows a
         quarter of its surface
     deeper : where nothing at all is found, look for instances that show half of `overlap_ratio`
-    time_limit_s : seconds for search, verification and refinement together; None: until nothing is likely to be missed
+    time_limit_s : seconds for search, verification and refinement together, of what is looked for anywhere: places of a
+        design are all tried; None: until nothing is likely to be missed
     miss_probability : stop when an instance that shows `overlap_ratio` of its surface has been missed with less than
         this chance; 0: use all of the time limit, as the paper does
     max_instances : stop after so many detections; None: all there are
