@@ -38,21 +38,11 @@ def pixels_towards(points, origin, reach, edge, nearest, silent, short, farthest
         wide = reach / distance * (1.0 + u * u + v * v)
         low_u, high_u = max(0, int((u - wide + 1.0) * 0.5 * edge)), min(edge - 1, int((u + wide + 1.0) * 0.5 * edge))
         low_v, high_v = max(0, int((v - wide + 1.0) * 0.5 * edge)), min(edge - 1, int((v + wide + 1.0) * 0.5 * edge))
-        least = max(floor((distance - short) / SHORT_STEP_M) * SHORT_STEP_M, 0.0)
-        if (
-            least > 0.0
-            and len(farthest)
-            and not _any_beyond(
-                least,
-                farthest,
-                edge // across,
-                face,
-                low_u // across,
-                high_u // across,
-                low_v // across,
-                high_v // across,
-            )
-        ):
+        least = 0.0
+        if distance > short:
+            least = floor((distance - short) / SHORT_STEP_M) * SHORT_STEP_M
+        asks = least <= 0.0 or len(farthest) == 0
+        if not asks and not _any_beyond(least, farthest, edge, across, face, low_u, high_u, low_v, high_v):
             continue
         units = np.int64(least * RANGE_UNITS)
         if wide * edge < BLOCK:  # half a block to each side
@@ -87,11 +77,12 @@ def _met_in(face, low_u, high_u, low_v, high_v, edge, nearest, silent, shortest,
 
 
 @kernel
-def _any_beyond(least, farthest, edge, face, low_u, high_u, low_v, high_v):
-    """Does any beam of some patches of a face go so far?"""
-    for iu in range(low_u, high_u + 1):
-        for iv in range(low_v, high_v + 1):
-            if farthest[(face * edge + iu) * edge + iv] >= least:
+def _any_beyond(least, farthest, edge, across, face, low_u, high_u, low_v, high_v):
+    """Does any beam of the patches go so far that some pixels of a face are in?"""
+    few = edge // across
+    for iu in range(low_u // across, high_u // across + 1):
+        for iv in range(low_v // across, high_v // across + 1):
+            if farthest[(face * few + iu) * few + iv] >= least:
                 return True
     return False
 
