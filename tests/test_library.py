@@ -119,6 +119,7 @@ def models(draw: st.DrawFn) -> Model:
         samples=OrientedCloud(draw(rows(n, 3)), draw(rows(n, 3)), signed),
         mesh=mesh,
         cloud=cloud,
+        pair_count=draw(st.integers(0, 10**6)),
         symmetry=Symmetry(draw(rows(1, 3))[0], parse_axes(axes)),
         similar=tuple(similar),
         placements=tuple(placements),

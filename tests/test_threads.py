@@ -7,7 +7,7 @@ from threading import Barrier
 
 import pytest
 
-from scanfind.threads import in_threads, once
+from scanfind.threads import each_in_threads, in_threads, once
 
 BOTH = Barrier(2)
 
@@ -34,6 +34,7 @@ class Asked:
 def test_pieces_come_back_in_order(jobs: int) -> None:
     pieces = in_threads(jobs, 17, lambda start, stop: list(range(start, stop)))
     assert [number for piece in pieces for number in piece] == list(range(17))
+    assert each_in_threads(jobs, range(17), lambda number: -number) == [-number for number in range(17)]
     assert in_threads(jobs, 0, lambda start, stop: start + stop) == []
 
 

@@ -87,7 +87,7 @@ def find(
     with clock("read"):
         sources = Sources(scans, origin)
     with clock("library"):
-        library = models_of(models, parameters, units, select, jobs, tell)  # 3.2 library: surface, pairs, hash table
+        library = models_of(models, parameters, units, select, jobs, tell)  # 3.2 model library: its surfaces
         box = box_searched(library, parameters.priors, parameters.search.max_instances)
 
     if free:  # one scale for all: from here on the scans are in metres, and everything is rigid

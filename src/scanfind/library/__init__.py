@@ -308,6 +308,7 @@ def _model(record: Record, arrays: Mapping[str, NDArray[Any]]) -> Model:
         samples=samples,
         mesh=mesh,
         cloud=cloud,
+        pair_count=int(facts["pairs"]),
         symmetry=_symmetry(facts["symmetry"]),
         similar=tuple(Similar(float(each["overlap"]), _pose(each)) for each in facts["similar"]),
         placements=placements,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from scanfind.errors import LibraryError
 from scanfind.library.pairs import PairTable, key_count
+from scanfind.threads import each_in_threads
 
 if TYPE_CHECKING:
     from scanfind.library.model import Model
@@ -54,8 +54,8 @@ def joint_table(
         raise LibraryError(msg)
     cells = key_count(models[0].parameters.pairs)
     numbers = np.arange(len(models)) if among is None else np.flatnonzero(among)
-    with ThreadPoolExecutor(jobs) as threads:
-        tables = list(threads.map(lambda k: pairs_once(models[k]) if each_once else models[k].pairs, numbers))
+    wanted = [models[number] for number in numbers.tolist()]
+    tables = each_in_threads(jobs, wanted, lambda model: pairs_once(model) if each_once else model.pairs)
     offsets = np.zeros(cells + 1, np.int64)
     for pairs in tables:
         offsets[1:] += np.bincount(pairs.keys, minlength=cells)

@@ -66,6 +66,7 @@ class Model:
     mesh : the triangles, for isolation; None for a model that is a piece of scan
     cloud : that piece of scan; None for a mesh
     symmetry : the rotations after which no scan could tell that it was turned
+    pair_count : how many pairs its samples make, as it was prepared; the pairs themselves are made when asked for
     similar : motions after which it could be taken for itself, though it is not, likeliest first
     placements : the design's products of this geometry
     """
@@ -80,6 +81,7 @@ class Model:
     samples: OrientedCloud
     mesh: Mesh | None
     cloud: CloudModel | None
+    pair_count: int
     symmetry: Symmetry
     similar: tuple[Similar, ...]
     placements: tuple[Placement, ...]
@@ -89,11 +91,6 @@ class Model:
     def pairs(self) -> PairTable:
         """The oriented pairs of the samples with their keys: made when a search first asks for them (decision 35)."""
         return build_pairs(self.samples, self.diameter, self.spacing, self.parameters.pairs)
-
-    @once
-    def pair_count(self) -> int:
-        """How many pairs there are, whether or not anybody has asked for them."""
-        return pair_count(self.samples, self.diameter, self.spacing, self.parameters.pairs)
 
     @once
     def covers(self) -> tuple[Cover, ...]:
@@ -166,6 +163,7 @@ def build_model(model: Mesh | CloudModel, parameters: ModelParameters = DEFAULTS
         samples=surface.samples,
         mesh=mesh,
         cloud=cloud,
+        pair_count=pair_count(surface.samples, surface.diameter, surface.spacing, parameters.pairs),
         symmetry=symmetry,
         similar=find_similar(itself, symmetry),
         placements=mesh.placements if mesh else (),

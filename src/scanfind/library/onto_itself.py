@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +11,7 @@ from scanfind.library.near_surface import near_samples, near_triangles, signed_d
 from scanfind.mesh import doubled_areas
 from scanfind.pose import Pose
 from scanfind.symmetry import turn_about
+from scanfind.threads import once
 
 if TYPE_CHECKING:
     from scanfind.library.surface import ModelSurface
@@ -87,7 +87,7 @@ class OntoItself:
             )
         )  # fmt: skip
 
-    @cached_property
+    @once
     def _in_order(self) -> tuple[Floats, Floats, Floats, int]:
         """The samples and their normals sorted along the longest side of their box, where they are there, which it is.
 
@@ -128,7 +128,7 @@ class OntoItself:
                 break
         return motion
 
-    @cached_property
+    @once
     def facets(self) -> list[Floats]:
         """Directions of the largest plane faces, largest first, up to sign."""
         normals = self.normals[:SETTLING_SAMPLES]

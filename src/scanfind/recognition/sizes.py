@@ -17,7 +17,7 @@ from scanfind.grid.scene import first_cell
 from scanfind.library.near_surface import near_model
 from scanfind.recognition.candidate import Standing
 from scanfind.recognition.stands import as_found
-from scanfind.threads import in_threads
+from scanfind.threads import each_in_threads
 
 if TYPE_CHECKING:
     from scanfind.design.elements import Element
@@ -164,10 +164,7 @@ class Sizes:
     ) -> list[Told]:
         """What the witnesses of each size say of each of its models, in order; models are asked for side by side."""
         whose = [(model, witnesses) for models, witnesses in asked for model in models]
-        pieces = in_threads(
-            self.all[0].ground.jobs, len(whose), lambda start, stop: [ask(*each) for each in whose[start:stop]]
-        )
-        return [each for piece in pieces for each in piece]
+        return each_in_threads(self.all[0].ground.jobs, whose, lambda each: ask(*each))
 
     def noise(self) -> float:
         """Spread of the raw points about the largest parts found, metres."""
